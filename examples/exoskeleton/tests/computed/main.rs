@@ -2,5 +2,6 @@
 
 mod foxglove_layout;
 mod lockstep;
+mod output;
 mod topology;
 mod virtual_time;

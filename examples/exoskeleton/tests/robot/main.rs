@@ -1,6 +1,5 @@
 //! The built program in real use: real processes, real time. The tests assert no times.
 
-mod output;
 mod overload;
 mod real_time;
 mod secured;

@@ -1,12 +1,13 @@
-//! Runs with output to a full disk, or to a pipe without a reader.
+//! Runs of the built program with output to a full disk, or to a pipe without a reader.
 
 use std::fs::File;
 use std::path::Path;
 use std::process::{Command, Output, Stdio};
 
 use exoskeleton::robot::topology::for_this_host;
+use sinew_robot_tests::process::folder;
 
-use crate::{PROGRAM, folder};
+const PROGRAM: &str = env!("CARGO_BIN_EXE_exoskeleton");
 
 const WALK: [&str; 7] = ["--lock-step", "--strides", "8", "--runs", "runs", "--report", "report.json"];
 
