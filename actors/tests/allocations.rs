@@ -9,10 +9,8 @@ use std::{
     marker::PhantomData,
     net::SocketAddrV4,
     pin::pin,
-    sync::{
-        Mutex, PoisonError,
-        mpsc::{SyncSender, sync_channel},
-    },
+    process::Command,
+    sync::mpsc::{SyncSender, sync_channel},
     task::{Context, Poll, Waker},
     time::Duration,
 };
@@ -30,8 +28,8 @@ use stats_alloc::{INSTRUMENTED_SYSTEM, StatsAlloc};
 #[global_allocator]
 static MEMORY: &StatsAlloc<System> = &INSTRUMENTED_SYSTEM;
 
-/// The count covers the whole process: one test at a time.
-static TURN: Mutex<()> = Mutex::new(());
+/// Set in the process of a single test.
+const ALONE: &str = "SINEW_TEST_ALONE";
 
 /// No wait is longer.
 const DEADLINE: Duration = Duration::from_secs(120);
@@ -285,7 +283,6 @@ fn node(name: &str, host: u8) -> NodeBuilder {
 
 /// Allocations in each part of the windows of messages between two nodes.
 fn parts<P: Filled>(how: How) -> Vec<usize> {
-    let _turn = TURN.lock().unwrap_or_else(PoisonError::into_inner);
     let (done, parts) = sync_channel(1);
     let there = AppSpec::new("there", move || There { how }).handles::<P>().handles::<Word>().own_thread();
     let here = AppSpec::new("home", move || Here::<P>::new(how, done.clone()));
@@ -342,28 +339,50 @@ fn assert_all_at_most(bound: usize, how: How) {
     assert_at_most::<Load<4096>>(bound, 4096, how);
 }
 
+/// Runs the body in a process of its own, as the count covers the whole process. `test` is the name of the calling
+/// test.
+fn alone(test: &str, body: impl FnOnce()) {
+    if std::env::var_os(ALONE).is_some() {
+        return body();
+    }
+    let mut program = Command::new(std::env::current_exe().unwrap());
+    let output = program.args([test, "--exact", "--nocapture"]).env(ALONE, "1").output().unwrap();
+    let report = String::from_utf8_lossy(&output.stdout);
+    println!("{report}");
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    assert!(report.contains("1 passed"), "there is no test {test}: {report}");
+}
+
 #[test]
 fn unconfirmed_message_between_nodes_allocates_nothing() {
-    assert_all_at_most(0, How::ThereAndBack(1));
-    assert_all_at_most(0, How::ThereAndBack(16));
+    alone("unconfirmed_message_between_nodes_allocates_nothing", || {
+        assert_all_at_most(0, How::ThereAndBack(1));
+        assert_all_at_most(0, How::ThereAndBack(16));
+    });
 }
 
 #[test]
 fn stream_value_by_datagram_allocates_nothing() {
-    // Two values of a flow in flight are one: the newer value replaces the older.
-    assert_at_most::<Setpoint<64>>(0, 64, How::ThereAndBack(1));
-    assert_at_most::<Setpoint<1000>>(0, 1000, How::ThereAndBack(1));
+    alone("stream_value_by_datagram_allocates_nothing", || {
+        // Two values of a flow in flight are one: the newer value replaces the older.
+        assert_at_most::<Setpoint<64>>(0, 64, How::ThereAndBack(1));
+        assert_at_most::<Setpoint<1000>>(0, 1000, How::ThereAndBack(1));
+    });
 }
 
 #[test]
 fn confirmed_message_and_outcome_allocate_nothing() {
-    assert_all_at_most(0, How::ConfirmedAndLookedAt(1));
-    assert_all_at_most(0, How::ConfirmedAndLookedAt(16));
+    alone("confirmed_message_and_outcome_allocate_nothing", || {
+        assert_all_at_most(0, How::ConfirmedAndLookedAt(1));
+        assert_all_at_most(0, How::ConfirmedAndLookedAt(16));
+    });
 }
 
 #[test]
 fn awaited_outcome_allocates_only_its_timer() {
-    // The first message of a window may find the previous timer still in use.
-    let of_the_edge = 2;
-    assert_all_at_most(WINDOW + of_the_edge, How::ConfirmedAndAwaited(1));
+    alone("awaited_outcome_allocates_only_its_timer", || {
+        // The first message of a window may find the previous timer still in use.
+        let of_the_edge = 2;
+        assert_all_at_most(WINDOW + of_the_edge, How::ConfirmedAndAwaited(1));
+    });
 }
