@@ -52,6 +52,8 @@ pub struct Merged {
     pub nodes: Vec<MergedNode>,
     /// Damaged records, which were skipped.
     pub damage: Vec<String>,
+    /// A line for each unfinished file: its end is missing from a byte and a time on.
+    pub unfinished: Vec<String>,
 }
 
 /// A file that is being merged.
@@ -126,6 +128,7 @@ fn names<P: AsRef<Path>>(files: &[P]) -> String {
 fn open(path: &Path, clocks: &Clocks, merged: &mut Merged) -> Result<Source, BagError> {
     let mut ordered = Ordered::open(path)?;
     merged.damage.extend_from_slice(ordered.damage());
+    merged.unfinished.extend(ordered.missing_end().map(str::to_owned));
     let text = |key: &str| {
         ordered.metadata(METADATA).and_then(|fields| fields.get(key)).cloned().unwrap_or_default()
     };

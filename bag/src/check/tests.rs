@@ -7,7 +7,7 @@ use super::*;
 use crate::{
     BagWriter, Class, Direction, Options, Origin,
     read::{Item, Reader},
-    testing::{TestFolder, channel, record, typed_channel},
+    testing::{TestFolder, channel, chunks, record, typed_channel},
 };
 
 const SECOND: u64 = 1_000_000_000;
@@ -411,16 +411,7 @@ fn damaged_chunk_is_named_and_the_rest_is_read() {
     let path = folder.path("walk.mcap");
     sent(&path);
     let bytes = fs::read(&path).unwrap();
-    // The places of all records, without the magic bytes at both ends.
-    let (mut at, mut chunks) = (8, Vec::new());
-    while at < bytes.len() - 8 {
-        let length = u64::from_le_bytes(bytes[at + 1..at + 9].try_into().unwrap()) as usize;
-        if bytes[at] == 0x06 {
-            chunks.push((at, length));
-        }
-        at += 9 + length;
-    }
-    let (at, length) = chunks[2];
+    let (at, length) = chunks(&bytes)[2];
     let found = |changed: usize| {
         let mut bytes = bytes.clone();
         bytes[changed] ^= 0x40;

@@ -9,7 +9,7 @@ use std::{
     sync::Arc,
 };
 
-use super::{Channel, End, Item, Reader, chunk, frames};
+use super::{Channel, Item, Reader, chunk, frames};
 use crate::error::{BagError, DamageList};
 
 /// Maximum bytes of chunks that overlap in time and so are in memory together.
@@ -45,7 +45,7 @@ pub struct Ordered {
     file: BufReader<File>,
     channels: BTreeMap<u16, Arc<Channel>>,
     metadata: BTreeMap<String, BTreeMap<String, String>>,
-    end: End,
+    missing_end: Option<String>,
     damage: Vec<String>,
     /// The chunks that are not loaded, the earliest last.
     waiting: Vec<Span>,
@@ -110,7 +110,7 @@ impl Ordered {
             file: BufReader::new(file),
             channels: reader.channels().clone(),
             metadata,
-            end: reader.end(),
+            missing_end: reader.missing_end(),
             damage,
             waiting,
             loaded: BTreeMap::new(),
@@ -130,10 +130,10 @@ impl Ordered {
         self.metadata.get(name)
     }
 
-    /// Returns how the file ended.
+    /// Returns the loss at the end of an unfinished file, as [`Reader::missing_end`] does.
     #[must_use]
-    pub const fn end(&self) -> End {
-        self.end
+    pub fn missing_end(&self) -> Option<&str> {
+        self.missing_end.as_deref()
     }
 
     /// Returns the damage that was found, and skipped: the first 1,000 records, and the number of the others.

@@ -38,7 +38,7 @@ pub(crate) fn of(played: &Played, is_wide: bool) -> Report {
     for (why, count) in played.reasons.iter().take(SHOWN_MAX) {
         line(&format!("rejected: {count}: {why}"));
     }
-    played.damage.iter().take(SHOWN_MAX).for_each(|damage| line(damage));
+    played.damage.iter().chain(&played.missing_ends).take(SHOWN_MAX).for_each(|damage| line(damage));
     if let End::Lost(why) = &played.end {
         line(&format!("ended early: the node is lost: {why}"));
     }
@@ -93,6 +93,7 @@ fn json_of(played: &Played, total: &Row) -> serde_json::Value {
         "sources": played.sources, "sent": total.sent, "rejected": total.rejected, "late": total.late,
         "absent": total.absent, "not_there": played.absent, "left_out": left_out, "reasons": played.reasons,
         "channels": channels.collect::<Vec<_>>(), "damage": played.damage,
+        "missing_ends": played.missing_ends,
         "lost_nodes": played.lost.iter().map(ToString::to_string).collect::<Vec<_>>(),
     })
 }
@@ -119,6 +120,7 @@ mod tests {
             absent: BTreeSet::from(["knee".to_owned()]),
             reasons: BTreeMap::new(),
             damage: Vec::new(),
+            missing_ends: Vec::new(),
             lost: BTreeSet::new(),
         }
     }

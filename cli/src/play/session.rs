@@ -67,6 +67,8 @@ pub(crate) struct Played {
     /// Reasons of rejections, each with its number. A reason is one of a few.
     pub(crate) reasons: BTreeMap<String, u64>,
     pub(crate) damage: Vec<String>,
+    /// The unfinished files: a killed recorder leaves one, and its messages are played.
+    pub(crate) missing_ends: Vec<String>,
     /// Nodes that were lost when the names were compared, at most as many as a node reports.
     pub(crate) lost: BTreeSet<NodeAddress>,
 }
@@ -102,6 +104,7 @@ pub(crate) fn play(
             absent: BTreeSet::new(),
             reasons: BTreeMap::new(),
             damage: playback.damage().to_vec(),
+            missing_ends: playback.missing_ends().to_vec(),
             lost: lost.into_iter().collect(),
         },
         due: 0,

@@ -1,6 +1,7 @@
 //! `sinew play`: recorded messages are sent again, and a program is checked against its recording.
 
 use std::{
+    fs,
     path::{Path, PathBuf},
     process::Command,
 };
@@ -211,6 +212,26 @@ fn first_message_that_differs_is_named() {
         "{}",
         answer.err
     );
+}
+
+#[test]
+fn check_of_a_file_that_is_cut_off_is_no_proof() {
+    let scenario = Scenario::new();
+    let file = recorded(&scenario.directory, &[1, 2, 3]);
+    let bytes = fs::read(&file).expect("it was written");
+    fs::write(&file, &bytes[..bytes.len() - 20]).expect("the test's own directory");
+    let answer = check(&scenario, &file, &[]);
+    assert_eq!(answer.code, Some(1), "{}{}", answer.out, answer.err);
+    for words in ["not whole: 3 messages", "unfinished: the file ends at byte"] {
+        assert!(answer.out.contains(words), "{words}: {}", answer.out);
+    }
+    // And: an end before the missing one is proved
+    let mut command = Command::new(env!("CARGO_BIN_EXE_sinew"));
+    let program = node_command();
+    command.args(["play", "--check"]).arg(&file).args(["--start-before", "20ms", "--to", "25ms", "--"]);
+    command.arg(program.get_program()).args(program.get_args()).arg(scenario.configure("hip", 1, &[]));
+    let answer = Answer::of(command.args(["--sends-to", "knee"]));
+    assert!(answer.code == Some(0) && answer.out.starts_with("identical"), "{}{}", answer.out, answer.err);
 }
 
 #[test]
