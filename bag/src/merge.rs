@@ -90,15 +90,19 @@ impl Source {
 /// [`check()`](crate::check()) refuses it. Check `files` before.
 ///
 /// # Errors
-/// A file cannot be read, `out` exists or cannot be written, or no clock reading connects a node with the reference. A
-/// file that cannot be completed is removed.
+/// A file cannot be read, `out` exists or cannot be written, two files are the same part of one recording, or no clock
+/// reading connects a node with the reference. A file that cannot be completed is removed.
 pub fn merge<P: AsRef<Path>>(files: &[P], out: impl AsRef<Path>) -> Result<Merged, BagError> {
     let out = out.as_ref();
     let clocks = Clocks::read(files)?;
     let mut merged = Merged::default();
-    let mut sources = Vec::new();
+    let (mut sources, mut given) = (Vec::new(), BTreeMap::new());
     for path in files {
-        let source = open(path.as_ref(), &clocks, &mut merged)?;
+        let path = path.as_ref();
+        let source = open(path, &clocks, &mut merged)?;
+        if let Some(former) = given.insert(identity(&source.ordered), path) {
+            return Err(twice(former, path));
+        }
         sources.push(source);
     }
     let file = OpenOptions::new().write(true).create_new(true).mode(0o600).open(out);
@@ -113,6 +117,19 @@ pub fn merge<P: AsRef<Path>>(files: &[P], out: impl AsRef<Path>) -> Result<Merge
         }
     })?;
     Ok(merged)
+}
+
+/// Returns the fields that no other file of any recording has: node, incarnation, begin of the recording, and part.
+fn identity(file: &Ordered) -> [String; 4] {
+    let text =
+        |key: &str| file.metadata(METADATA).and_then(|fields| fields.get(key)).cloned().unwrap_or_default();
+    ["address", "incarnation", "began_ns", "part"].map(text)
+}
+
+/// Returns why two files are refused that have one content: each of its messages would be there twice.
+fn twice(former: &Path, path: &Path) -> BagError {
+    let (former, path) = (former.display(), path.display());
+    BagError::Unfit(format!("{former} and {path} are the same part of one recording; give only one of them"))
 }
 
 /// Returns the names of the first files, without their folders.

@@ -385,7 +385,12 @@ fn dropped_messages_of_all_recordings_count_together() {
 fn merged_file_is_refused_with_names_of_its_files() {
     let folder = TestFolder::new();
     let files = ["one.mcap", "again.mcap"].map(|name| folder.path(name));
-    files.iter().for_each(|path| sent(path));
+    for (path, address) in files.iter().zip(["127.0.0.2", "127.0.0.3"]) {
+        let mut bag = BagWriter::create(path, Options::default(), origin(address)).unwrap();
+        let reading = crate::ClockReading { peer: "127.0.0.2".into(), incarnation: 1, ..Default::default() };
+        bag.clock(SECOND, &reading).unwrap();
+        bag.finish(2 * SECOND).unwrap();
+    }
     let out = folder.path("all.mcap");
     crate::merge(&files, &out).unwrap();
     let fault = check(&[out]).unwrap_err().to_string();

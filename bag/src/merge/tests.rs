@@ -111,3 +111,24 @@ fn node_without_a_clock_reading_is_named() {
     let fault = merge(&files, folder.path("all.mcap")).unwrap_err().to_string();
     assert!(fault.contains("connects its node b with a"), "{fault}");
 }
+
+#[test]
+fn recording_that_is_given_twice_is_refused() {
+    let folder = TestFolder::new();
+    let path = write(&folder, "a", 0, 0, None);
+    let copy = folder.path("copy.mcap");
+    fs::copy(&path, &copy).unwrap();
+    for second in [&path, &copy] {
+        let out = folder.path("all.mcap");
+        let fault = merge(&[&path, second], &out).unwrap_err().to_string();
+        let words = format!("{} and {} are the same part", path.display(), second.display());
+        assert!(fault.starts_with(&words), "{fault}");
+        assert!(!out.exists());
+    }
+    // And: a later recording of the same node is another one
+    let later = folder.path("later.mcap");
+    let origin =
+        Origin { node: "a".into(), address: "a".into(), incarnation: 1, began_ns: 9, ..Origin::default() };
+    BagWriter::create(&later, Options::default(), origin).unwrap().finish(10).unwrap();
+    merge(&[&path, &later], folder.path("all.mcap")).unwrap();
+}
