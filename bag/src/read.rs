@@ -193,7 +193,9 @@ impl<R: Read> Reader<R> {
     /// Returns the time from the first message of the file, as text.
     fn offset(&self, at_ns: u64) -> String {
         let first_ns = self.times.map_or(at_ns, |(first_ns, _)| first_ns);
-        format!("{:.3} s", Duration::from_nanos(at_ns.saturating_sub(first_ns)).as_secs_f64())
+        let offset = Duration::from_nanos(at_ns.saturating_sub(first_ns));
+        // As the times of a replay are written.
+        format!("{}.{:09}s", offset.as_secs(), offset.subsec_nanos())
     }
 
     /// Returns the channels that were read so far.

@@ -191,9 +191,10 @@ fn differs(difference: &ReportedDifference, names: &BTreeMap<u64, String>, damag
     let ReportedDifference { source, number, at_ns, type_name, destination, difference, misfit } = difference;
     let shown = |tid: u64| names.get(&tid).cloned().unwrap_or_else(|| Tid::from_bits(tid).to_string());
     let (source, destination) = (shown(*source), shown(*destination));
-    let seconds = *at_ns as f64 / 1e9;
+    // As in the other lines of the report.
+    let at = Time::from_nanos(*at_ns);
     let line = format!(
-        "the first difference: message {number} of {source}, {type_name} to {destination} at {seconds:.6} s: \
+        "the first difference: message {number} of {source}, {type_name} to {destination} at {at:?}: \
          {difference}"
     );
     let mut text = format!("{}\n", clean(&line));
@@ -221,11 +222,11 @@ mod tests {
             type_name: "demo.torque".to_owned(),
             destination: Tid::from_bits(0x0a00_0002_0000_1001).bits(),
             difference: "`newton_metres` was 5.0 and is 2.5".to_owned(),
-            misfit: None,
+            misfit: Some("2 recorded messages, the first at 1.500000000s".to_owned()),
         };
         let report = differs(&difference, &BTreeMap::from([(5, "knee".to_owned())]), &[]);
-        let expected = "the first difference: message 7 of knee, demo.torque to 10.0.0.2/1001 at 1.500000 s: \
-                        `newton_metres` was 5.0 and is 2.5\n";
+        let expected = "the first difference: message 7 of knee, demo.torque to 10.0.0.2/1001 at 1.500000000s: \
+                        `newton_metres` was 5.0 and is 2.5\n2 recorded messages, the first at 1.500000000s\n";
         assert_eq!((report.text.as_str(), report.is_fine), (expected, false));
         assert_eq!(report.json["source"], "knee");
     }

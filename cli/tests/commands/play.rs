@@ -200,7 +200,7 @@ fn first_message_that_differs_is_named() {
     let file = recorded(&scenario.directory, &[1, 2, 9, 9]);
     let answer = check(&scenario, &file, &[]);
     assert_eq!(answer.code, Some(1), "{}{}", answer.out, answer.err);
-    let expected = "the first difference: message 3 of hip, scenario.count to knee at 1.040000 s: `number` was 9 and is 3\n";
+    let expected = "the first difference: message 3 of hip, scenario.count to knee at 1.040000000s: `number` was 9 and is 3\n";
     assert_eq!(answer.out, expected, "{}", answer.err);
     let json = check(&scenario, &file, &["--json"]).json();
     assert_eq!((&json["result"], &json["number"]), (&"differs".into(), &3.into()), "{json}");
