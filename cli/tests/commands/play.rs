@@ -9,7 +9,7 @@ use std::{
 use rustix::process::Signal;
 use sinew::{AppAddress, NodeAddress, NodeApi, Registration, Tid, message::Kind};
 use sinew_bag::{BagWriter, ChannelInfo, Class, Direction, Options, Origin, Party, Record};
-use sinew_testkit::{NodeProcess, TestDirectory, program};
+use sinew_testkit::{NodeProcess, TestDirectory, program, until};
 
 use crate::scenario::{Answer, Scenario, named, node_command, sinew};
 
@@ -129,6 +129,37 @@ fn recorded_messages_arrive_as_from_the_recorded_name() {
     let counts = channels.iter().find(|one| one["channel"] == "/hip/scenario.count").expect("it was played");
     assert_eq!((&counts["sent"], &counts["rejected"], &counts["absent"]), (&3.into(), &0.into(), &0.into()));
     assert!(json["left_out"].as_object().is_some_and(serde_json::Map::is_empty), "its own project: {json}");
+}
+
+#[test]
+fn second_command_in_one_project_names_the_first() {
+    let scenario = Scenario::new();
+    let file = recorded(&scenario.directory, &[1]);
+    let project = project();
+    let command = || {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_sinew"));
+        command.args(["play", text(&file), "--project", &project, "--wait", "60s"]);
+        command.env("XDG_RUNTIME_DIR", scenario.directory.join(""));
+        command
+    };
+    // Given: a command that waits for the knee. It has a socket when its node has one
+    let mut first = NodeProcess::start("sinew play", command());
+    until("the first command has its node", || {
+        fs::read_dir(scenario.directory.join("sinew")).ok()?.next().map(|_| ())
+    });
+    // When
+    let answer = Answer::of(&mut command());
+    // Then
+    assert_eq!(answer.code, Some(1), "{}{}", answer.out, answer.err);
+    for words in [
+        format!("another `sinew play` runs in the project {project}"),
+        "127.0.83.119".to_owned(),
+        format!("--project {project}-2"),
+    ] {
+        assert!(answer.err.contains(&words), "{words}: {}", answer.err);
+    }
+    first.signal(Signal::INT);
+    assert_eq!(first.wait_for_exit(), Some(0));
 }
 
 #[test]
