@@ -46,30 +46,35 @@ fn recorded(directory: &TestDirectory, numbers: &[u64]) -> PathBuf {
 
 /// Writes the recording of a hip that sends these counts to the knee, and these as protected commands.
 fn written(directory: &TestDirectory, numbers: &[u64], commands: &[u64]) -> PathBuf {
+    let ends = [(1, "hip"), (2, "knee")];
+    file_of(directory, &[(ends, false, numbers), (ends, true, commands)])
+}
+
+/// A channel: source and destination with their numbers, whether it is protected, and its counts.
+type Sent<'a> = ([(u32, &'a str); 2], bool, &'a [u64]);
+
+/// Writes the recording of the hip's node with these channels.
+fn file_of(directory: &TestDirectory, all: &[Sent<'_>]) -> PathBuf {
     let path = directory.join("walk.mcap");
     let origin =
         Origin { node: "hip".into(), address: "127.0.0.1".into(), incarnation: 1, ..Origin::default() };
     let mut bag = BagWriter::create(&path, Options::default(), origin).expect("the test's own directory");
-    let (hip, knee) = (party(1, "hip"), party(2, "knee"));
     let type_name = "scenario.count";
-    let mut channel = |is_protected| {
-        let info = ChannelInfo {
-            source: &hip,
-            destination: &knee,
+    for ([source, destination], is_protected, values) in all {
+        let channel = bag.channel(&ChannelInfo {
+            source: &party(source.0, source.1),
+            destination: &party(destination.0, destination.1),
             type_name,
             kind: Kind::named(type_name).bits(),
             class: Class::Bulk,
             direction: Direction::Sent,
-            is_protected,
+            is_protected: *is_protected,
             schema: None,
             refused: None,
             seen_before: 0,
-        };
-        bag.channel(&info).expect("there is room")
-    };
-    let channels = [channel(false), channel(true)];
-    for (channel, values) in channels.into_iter().zip([numbers, commands]) {
-        for (number, value) in (1..).zip(values) {
+        });
+        let channel = channel.expect("there is room");
+        for (number, value) in (1..).zip(*values) {
             let at_ns = FIRST_NS + (number - 1) * PERIOD_NS;
             let (sent_ns, handed_over_ns, payload) = (at_ns, at_ns, &count(*value)[..]);
             let record =
@@ -129,6 +134,23 @@ fn recorded_messages_arrive_as_from_the_recorded_name() {
     let counts = channels.iter().find(|one| one["channel"] == "/hip/scenario.count").expect("it was played");
     assert_eq!((&counts["sent"], &counts["rejected"], &counts["absent"]), (&3.into(), &0.into(), &0.into()));
     assert!(json["left_out"].as_object().is_some_and(serde_json::Map::is_empty), "its own project: {json}");
+}
+
+#[test]
+fn message_to_a_played_source_has_no_receiver() {
+    let scenario = Scenario::new();
+    let (hip, knee) = ((1, "hip"), (2, "knee"));
+    let file =
+        file_of(&scenario.directory, &[([hip, knee], false, &[1, 2, 3]), ([knee, hip], false, &[4, 5])]);
+    // When: both ends are sources, so the command has both names
+    let project = project();
+    let words = ["play", text(&file), "--project", &project, "--rate", "max", "--deadline-ms", "10000"];
+    let answer = sinew(&[&words[..], &["--json"]].concat(), &scenario.directory.join(""));
+    // Then
+    assert_eq!(answer.code, Some(0), "{}{}", answer.out, answer.err);
+    let json = answer.json();
+    assert_eq!((&json["sent"], &json["absent"]), (&0.into(), &5.into()), "{json}");
+    assert_eq!(json["played_itself"], serde_json::json!(["hip", "knee"]), "{json}");
 }
 
 #[test]
