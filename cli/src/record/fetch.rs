@@ -6,7 +6,7 @@ mod dead;
 mod tests;
 
 use std::{
-    collections::BTreeSet,
+    collections::{BTreeMap, BTreeSet},
     fs::{self, OpenOptions},
     io::Write,
     ops::RangeInclusive,
@@ -69,10 +69,21 @@ struct Found {
     dead: Vec<DeadRing>,
     /// Nodes that have nothing to hand out, with the reason.
     refused: Vec<String>,
+    /// Nodes that were there, and did not answer when their spans were fetched.
+    silent: BTreeMap<NodeAddress, Silent>,
     /// Rings that are not gathered, with the remedy.
     skipped: BTreeSet<String>,
     /// Nodes that do not answer, and rings that cannot be read.
     faults: Vec<String>,
+}
+
+/// A node that does not answer any more.
+struct Silent {
+    name: String,
+    /// The reason, of the first span.
+    why: String,
+    /// The IDs of the spans that it has not handed out.
+    spans: Vec<String>,
 }
 
 /// Lists or gathers.
@@ -98,7 +109,22 @@ pub(super) fn show(system: &mut System, order: &Order) -> Result<Report, SystemE
     for id in ids {
         gather(system, &mut found, &id, (&out, order.force), &mut files);
     }
+    found.report_silent();
     Ok(gathered(&found, &files))
+}
+
+impl Found {
+    /// Adds one fault for each node that did not answer any more, with all spans that it has not handed out.
+    fn report_silent(&mut self) {
+        let line = |(node, Silent { name, why, spans }): (NodeAddress, Silent)| {
+            format!(
+                "{node} {name} has ended, or does not answer any more: {why}; not fetched: {}. Fetch again when it is \
+                 there",
+                spans.join(", ")
+            )
+        };
+        self.faults.extend(std::mem::take(&mut self.silent).into_iter().map(line));
+    }
 }
 
 /// Asks all nodes, and looks for rings of dead nodes on this host.
@@ -143,6 +169,10 @@ fn gather(
         }
         match fetch(system, *node, span, (out, is_forced), files) {
             Ok(file) => files.push(file),
+            Err(SystemError::NoAnswer(_, why)) => {
+                let silent = || Silent { name: name.clone(), why, spans: Vec::new() };
+                found.silent.entry(*node).or_insert_with(silent).spans.push(id.to_owned());
+            }
             Err(why) => faults.push(format!("{node} {name}: {why}")),
         }
     }
@@ -355,7 +385,7 @@ fn ask(system: &mut System, node: NodeAddress, question: &AskFrozen) -> Result<F
     let until = Time::now() + BUSY_WITHIN;
     loop {
         let answer: Result<FrozenReport, _> = system.endpoint.message(to, question).ask(within);
-        let report = answer.map_err(|error| SystemError::Bag(in_words(&error)))?;
+        let report = answer.map_err(|error| SystemError::NoAnswer(node.to_string(), in_words(&error)))?;
         match report.refused {
             Some(why) if why == FROZEN_BUSY && Time::now() < until => std::thread::sleep(BUSY_PAUSE),
             Some(why) => return Err(SystemError::Bag(clean(&why))),

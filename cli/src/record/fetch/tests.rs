@@ -75,3 +75,21 @@ fn missing_edges_of_a_span_are_stated() {
     let whole = Converted { times: 0..=u64::MAX, ..written(Path::new("knee.mcap")) };
     assert_eq!(whole.json()["span_ns"].as_u64(), None);
 }
+
+#[test]
+fn node_that_ended_has_one_line_for_all_its_spans() {
+    let silent = |name: &str| Silent {
+        name: name.to_owned(),
+        why: "no answer within 1s".to_owned(),
+        spans: vec!["a-1".to_owned(), "a-2".to_owned()],
+    };
+    let nodes = [(NodeAddress::new(1), silent("hip")), (NodeAddress::new(2), silent("knee"))];
+    let mut found = Found { silent: BTreeMap::from(nodes), ..Found::default() };
+    found.report_silent();
+    let report = gathered(&found, &[]);
+    assert_eq!(report.text.lines().count(), 2, "{}", report.text);
+    for words in ["0.0.0.1 hip has ended, or does not answer any more: no answer", "not fetched: a-1, a-2"] {
+        assert!(report.text.contains(words), "{words}: {}", report.text);
+    }
+    assert!(!report.is_fine);
+}
