@@ -29,6 +29,10 @@ pub(crate) const MERGED: &str = "sinew.merged";
 pub(crate) const MERGED_FILES: &str = "files";
 /// Maximum names in it.
 const FILES_MAX: usize = 64;
+/// Its field with the losses of the former files, a line for each; absent if all were whole.
+pub(crate) const MERGED_LOSSES: &str = "losses";
+/// Maximum lines in it.
+pub(crate) const LOSSES_MAX: usize = 16;
 
 /// A node of a merged file.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
@@ -219,6 +223,10 @@ fn write(
     ]);
     for MergedNode { address, bound_ns, .. } in &merged.nodes {
         metadata.insert(format!("bound_ns {address}"), bound_ns.to_string());
+    }
+    let losses: Vec<_> = merged.unfinished.iter().chain(&merged.damage).take(LOSSES_MAX).cloned().collect();
+    if !losses.is_empty() {
+        metadata.insert(MERGED_LOSSES.to_owned(), losses.join("\n"));
     }
     writer.write_metadata(&mcap::records::Metadata { name: MERGED.to_owned(), metadata })?;
     writer.finish()?;

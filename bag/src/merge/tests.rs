@@ -132,3 +132,28 @@ fn recording_that_is_given_twice_is_refused() {
     BagWriter::create(&later, Options::default(), origin).unwrap().finish(10).unwrap();
     merge(&[&path, &later], folder.path("all.mcap")).unwrap();
 }
+
+#[test]
+fn loss_of_a_merged_file_is_known_later() {
+    let folder = TestFolder::new();
+    let files = [
+        write(&folder, "a", 0, 0, Some(("b", 60 * SECOND as i64))),
+        write(&folder, "b", 60 * SECOND as i64, 0, None),
+    ];
+    let losses = |out: &str| {
+        let out = folder.path(out);
+        merge(&files, &out).unwrap();
+        let merged = Ordered::open(&out).unwrap();
+        assert_eq!(merged.missing_end(), None);
+        merged.damage().to_vec()
+    };
+    assert_eq!(losses("whole.mcap"), [""; 0]);
+    // When: the end of one file is cut off
+    let bytes = fs::read(&files[1]).unwrap();
+    fs::write(&files[1], &bytes[..bytes.len() - 20]).unwrap();
+    let found = losses("cut.mcap");
+    assert!(
+        matches!(&found[..], [loss] if loss.contains("cut.mcap: one of the files") && loss.contains("b.mcap: unfinished")),
+        "{found:?}"
+    );
+}

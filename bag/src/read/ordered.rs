@@ -10,7 +10,10 @@ use std::{
 };
 
 use super::{Channel, Item, Reader, chunk, frames};
-use crate::error::{BagError, DamageList};
+use crate::{
+    error::{BagError, DamageList},
+    merge::{LOSSES_MAX, MERGED, MERGED_LOSSES},
+};
 
 /// Maximum bytes of chunks that overlap in time and so are in memory together.
 const OVERLAP_MAX: u64 = 1 << 30;
@@ -99,6 +102,13 @@ impl Ordered {
             }
         }
         let mut damage = damage.into_lines(path);
+        // What was missing before is missing now.
+        let losses =
+            metadata.get(MERGED).and_then(|fields: &BTreeMap<String, String>| fields.get(MERGED_LOSSES));
+        let losses = losses.map_or("", String::as_str).lines().take(LOSSES_MAX);
+        damage.extend(losses.map(|loss| {
+            format!("{}: one of the files that it was made of was not whole: {loss}", path.display())
+        }));
         if outside > 0 {
             damage.push(format!("{}: {outside} messages outside of chunks are left out", path.display()));
         }
@@ -136,7 +146,8 @@ impl Ordered {
         self.missing_end.as_deref()
     }
 
-    /// Returns the damage that was found, and skipped: the first 1,000 records, and the number of the others.
+    /// Returns the damage that was found, and skipped: the first 1,000 records, and the number of the others. A merged
+    /// file also has the losses of the files that it was made of.
     #[must_use]
     pub fn damage(&self) -> &[String] {
         &self.damage
