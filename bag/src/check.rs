@@ -37,6 +37,8 @@ pub enum Kind {
     Unsent,
     /// The file of a node is absent, so one end is not compared.
     NoFile,
+    /// A file has no tally, so nothing about its messages is provable.
+    NoTally,
 }
 
 /// A finding.

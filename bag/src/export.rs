@@ -18,7 +18,7 @@ use std::{
 use serde::Serialize;
 
 use crate::{
-    error::BagError,
+    error::{BagError, DamageList},
     read::{Channel, Header, Item, Message, Reader, Role},
 };
 use columns::{Columns, Row};
@@ -56,6 +56,17 @@ pub struct Exported {
     pub left_out: u64,
 }
 
+/// The result of [`export()`].
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
+pub struct Exports {
+    /// The files that were written.
+    pub files: Vec<Exported>,
+    /// Damaged records, which were skipped: the first 1,000, and the number of the others.
+    pub damage: Vec<String>,
+    /// The loss at the end of an unfinished recording: from which byte and which time on messages may be missing.
+    pub unfinished: Option<String>,
+}
+
 /// A row of one channel, until the header behind it is read.
 struct Pending {
     topic: String,
@@ -70,18 +81,14 @@ trait Table {
 
 /// Writes a file for each channel of payloads into the folder `out`, which is made if it is absent. Columns are the
 /// times, the header, and the values of the payload: `angle.degrees`, `joints.0`. The file is read twice: first for the
-/// columns.
+/// columns. Damaged records, and a missing end, are in the result: all that can be read is exported.
 ///
 /// # Errors
 /// The file cannot be read, or a file in `out` exists or cannot be written.
-pub fn export(
-    path: impl AsRef<Path>,
-    out: impl AsRef<Path>,
-    format: Format,
-) -> Result<Vec<Exported>, BagError> {
+pub fn export(path: impl AsRef<Path>, out: impl AsRef<Path>, format: Format) -> Result<Exports, BagError> {
     let (path, out) = (path.as_ref(), out.as_ref());
     let mut all: BTreeMap<String, Columns> = BTreeMap::new();
-    read(path, |topic, row| {
+    let (damage, unfinished) = read(path, |topic, row| {
         all.entry(topic.to_owned()).or_default().add(&row);
         Ok(())
     })?;
@@ -104,7 +111,7 @@ pub fn export(
     for (file, table) in tables.into_values() {
         table.finish().map_err(|cause| BagError::write(&file, cause))?;
     }
-    Ok(exported.into_values().collect())
+    Ok(Exports { files: exported.into_values().collect(), damage, unfinished })
 }
 
 fn table(file: &Path, columns: &Columns, format: Format) -> io::Result<Box<dyn Table>> {
@@ -133,16 +140,23 @@ fn name(topic: &str, names: &mut BTreeSet<String>) -> String {
     found
 }
 
-/// Reads the rows of all channels with payloads.
-fn read(path: &Path, mut each: impl FnMut(&str, Row) -> Result<(), BagError>) -> Result<(), BagError> {
+/// Reads the rows of all channels with payloads. Returns a line for each damaged record, and the loss at the end of an
+/// unfinished file.
+fn read(
+    path: &Path,
+    mut each: impl FnMut(&str, Row) -> Result<(), BagError>,
+) -> Result<(Vec<String>, Option<String>), BagError> {
     let mut reader = Reader::open(path)?;
     let mut pending: Option<Pending> = None;
+    let mut damage = DamageList::default();
     loop {
         let item = match reader.next_item() {
             Ok(Some(item)) => item,
             Ok(None) => break,
-            // Later records are still exported; `check` reports the damage.
-            Err(BagError::Damaged { .. }) => continue,
+            Err(error @ BagError::Damaged { .. }) => {
+                damage.add(&error);
+                continue;
+            }
             Err(error) => return Err(error),
         };
         let Item::Message(message) = item else { continue };
@@ -163,7 +177,10 @@ fn read(path: &Path, mut each: impl FnMut(&str, Row) -> Result<(), BagError>) ->
             Role::Other => {}
         }
     }
-    pending.map_or(Ok(()), |Pending { topic, row }| each(&topic, row))
+    if let Some(Pending { topic, row }) = pending {
+        each(&topic, row)?;
+    }
+    Ok((damage.into_lines(path), reader.missing_end()))
 }
 
 fn row(message: &Message<'_>) -> Row {

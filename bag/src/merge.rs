@@ -29,6 +29,10 @@ pub(crate) const MERGED: &str = "sinew.merged";
 pub(crate) const MERGED_FILES: &str = "files";
 /// Maximum names in it.
 const FILES_MAX: usize = 64;
+/// Its field with the losses of the former files, a line for each; absent if all were whole.
+pub(crate) const MERGED_LOSSES: &str = "losses";
+/// Maximum lines in it.
+pub(crate) const LOSSES_MAX: usize = 16;
 
 /// A node of a merged file.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
@@ -52,6 +56,8 @@ pub struct Merged {
     pub nodes: Vec<MergedNode>,
     /// Damaged records, which were skipped.
     pub damage: Vec<String>,
+    /// A line for each unfinished file: its end is missing from a byte and a time on.
+    pub unfinished: Vec<String>,
 }
 
 /// A file that is being merged.
@@ -88,15 +94,19 @@ impl Source {
 /// [`check()`](crate::check()) refuses it. Check `files` before.
 ///
 /// # Errors
-/// A file cannot be read, `out` exists or cannot be written, or no clock reading connects a node with the reference. A
-/// file that cannot be completed is removed.
+/// A file cannot be read, `out` exists or cannot be written, two files are the same part of one recording, or no clock
+/// reading connects a node with the reference. A file that cannot be completed is removed.
 pub fn merge<P: AsRef<Path>>(files: &[P], out: impl AsRef<Path>) -> Result<Merged, BagError> {
     let out = out.as_ref();
     let clocks = Clocks::read(files)?;
     let mut merged = Merged::default();
-    let mut sources = Vec::new();
+    let (mut sources, mut given) = (Vec::new(), BTreeMap::new());
     for path in files {
-        let source = open(path.as_ref(), &clocks, &mut merged)?;
+        let path = path.as_ref();
+        let source = open(path, &clocks, &mut merged)?;
+        if let Some(former) = given.insert(identity(&source.ordered), path) {
+            return Err(twice(former, path));
+        }
         sources.push(source);
     }
     let file = OpenOptions::new().write(true).create_new(true).mode(0o600).open(out);
@@ -113,6 +123,19 @@ pub fn merge<P: AsRef<Path>>(files: &[P], out: impl AsRef<Path>) -> Result<Merge
     Ok(merged)
 }
 
+/// Returns the fields that no other file of any recording has: node, incarnation, begin of the recording, and part.
+fn identity(file: &Ordered) -> [String; 4] {
+    let text =
+        |key: &str| file.metadata(METADATA).and_then(|fields| fields.get(key)).cloned().unwrap_or_default();
+    ["address", "incarnation", "began_ns", "part"].map(text)
+}
+
+/// Returns why two files are refused that have one content: each of its messages would be there twice.
+fn twice(former: &Path, path: &Path) -> BagError {
+    let (former, path) = (former.display(), path.display());
+    BagError::Unfit(format!("{former} and {path} are the same part of one recording; give only one of them"))
+}
+
 /// Returns the names of the first files, without their folders.
 fn names<P: AsRef<Path>>(files: &[P]) -> String {
     let name = |path: &P| path.as_ref().file_name().unwrap_or_default().to_string_lossy().into_owned();
@@ -126,6 +149,7 @@ fn names<P: AsRef<Path>>(files: &[P]) -> String {
 fn open(path: &Path, clocks: &Clocks, merged: &mut Merged) -> Result<Source, BagError> {
     let mut ordered = Ordered::open(path)?;
     merged.damage.extend_from_slice(ordered.damage());
+    merged.unfinished.extend(ordered.missing_end().map(str::to_owned));
     let text = |key: &str| {
         ordered.metadata(METADATA).and_then(|fields| fields.get(key)).cloned().unwrap_or_default()
     };
@@ -199,6 +223,10 @@ fn write(
     ]);
     for MergedNode { address, bound_ns, .. } in &merged.nodes {
         metadata.insert(format!("bound_ns {address}"), bound_ns.to_string());
+    }
+    let losses: Vec<_> = merged.unfinished.iter().chain(&merged.damage).take(LOSSES_MAX).cloned().collect();
+    if !losses.is_empty() {
+        metadata.insert(MERGED_LOSSES.to_owned(), losses.join("\n"));
     }
     writer.write_metadata(&mcap::records::Metadata { name: MERGED.to_owned(), metadata })?;
     writer.finish()?;

@@ -16,6 +16,7 @@ use std::{
     io::{BufReader, Read},
     path::{Path, PathBuf},
     sync::Arc,
+    time::Duration,
 };
 
 use crate::error::BagError;
@@ -125,6 +126,8 @@ pub struct Reader<R> {
     is_summary: bool,
     messages: Option<u64>,
     end: End,
+    /// The time of the first message, and the latest time of any, in nanoseconds of the file's wall clock.
+    times: Option<(u64, u64)>,
 }
 
 impl Reader<BufReader<File>> {
@@ -158,6 +161,7 @@ impl<R: Read> Reader<R> {
             is_summary: false,
             messages: None,
             end: End::Open,
+            times: None,
         })
     }
 
@@ -171,6 +175,27 @@ impl<R: Read> Reader<R> {
     #[must_use]
     pub const fn end(&self) -> End {
         self.end
+    }
+
+    /// Returns the loss at the end of an unfinished file, as a line: from which byte and which time on messages may be
+    /// missing. `None` before the end, and for a finished file.
+    #[must_use]
+    pub fn missing_end(&self) -> Option<String> {
+        let End::Unfinished { at } = self.end else { return None };
+        let last_ns = self.times.map_or(0, |(_, last_ns)| last_ns);
+        Some(format!(
+            "{}: unfinished: the file ends at byte {at}, without its summary; messages after {} of it may be missing",
+            self.path.display(),
+            self.offset(last_ns)
+        ))
+    }
+
+    /// Returns the time from the first message of the file, as text.
+    fn offset(&self, at_ns: u64) -> String {
+        let first_ns = self.times.map_or(at_ns, |(first_ns, _)| first_ns);
+        let offset = Duration::from_nanos(at_ns.saturating_sub(first_ns));
+        // As the times of a replay are written.
+        format!("{}.{:09}s", offset.as_secs(), offset.subsec_nanos())
     }
 
     /// Returns the channels that were read so far.
@@ -200,6 +225,7 @@ impl<R: Read> Reader<R> {
             if self.chunk_at < self.chunk.len() {
                 // The borrow checker needs the place of the message, not the message.
                 if let Some(found) = self.chunk_record()? {
+                    self.note_time(found.log_ns);
                     return Ok(Some(Item::Message(self.message(&found))));
                 }
                 continue;
@@ -212,11 +238,19 @@ impl<R: Read> Reader<R> {
             };
             match self.file_record(frame)? {
                 Some(Whole::Metadata(name, fields)) => return Ok(Some(Item::Metadata(name, fields))),
-                Some(Whole::Message(found)) => return Ok(Some(Item::Message(self.message(&found)))),
+                Some(Whole::Message(found)) => {
+                    self.note_time(found.log_ns);
+                    return Ok(Some(Item::Message(self.message(&found))));
+                }
                 Some(Whole::End) => return Ok(None),
                 None => {}
             }
         }
+    }
+
+    fn note_time(&mut self, log_ns: u64) {
+        let (_, last_ns) = self.times.get_or_insert((log_ns, log_ns));
+        *last_ns = log_ns.max(*last_ns);
     }
 
     fn message(&self, found: &Found) -> Message<'_> {
@@ -254,7 +288,7 @@ impl<R: Read> Reader<R> {
                 self.chunk_at = 0;
                 if let Err(fault) = chunk::records(self.frames.body(), &mut self.chunk) {
                     self.chunk.clear();
-                    return Err(self.frames.damaged(&format!("a chunk is damaged: {fault}")));
+                    return Err(self.frames.damaged(&self.damaged_chunk(&fault)));
                 }
             }
             frames::SCHEMA | frames::CHANNEL if !self.is_summary => {
@@ -275,6 +309,15 @@ impl<R: Read> Reader<R> {
             _ => {}
         }
         Ok(None)
+    }
+
+    /// Returns the fault of a chunk, with the times that it states for its messages.
+    fn damaged_chunk(&self, fault: &str) -> String {
+        let times = chunk::times(self.frames.body()).map_or_else(String::new, |(first_ns, last_ns)| {
+            let [first, last] = [first_ns, last_ns].map(|at_ns| self.offset(at_ns));
+            format!("; its messages, from {first} to {last} of the file, are missing")
+        });
+        format!("a chunk is damaged: {fault}{times}")
     }
 
     /// Reads a record of the current chunk.

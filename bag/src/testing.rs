@@ -82,3 +82,17 @@ pub(crate) fn record(number: u64, at_ns: u64) -> Record<'static> {
         ..Record::default()
     }
 }
+
+/// Returns the place and the length of each chunk of a file.
+pub(crate) fn chunks(bytes: &[u8]) -> Vec<(usize, usize)> {
+    // The places of all records, without the magic bytes at both ends.
+    let (mut at, mut chunks) = (8, Vec::new());
+    while at < bytes.len() - 8 {
+        let length = u64::from_le_bytes(bytes[at + 1..at + 9].try_into().unwrap()) as usize;
+        if bytes[at] == 0x06 {
+            chunks.push((at, length));
+        }
+        at += 9 + length;
+    }
+    chunks
+}

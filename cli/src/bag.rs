@@ -264,12 +264,14 @@ fn merged_report(merged: &Merged, out: &std::path::Path, is_wide: bool) -> Repor
         table.row([node.node.clone(), node.address.clone(), node.messages.to_string(), error]);
     }
     let mut text = table.text();
-    for damage in &merged.damage {
+    for damage in merged.damage.iter().chain(&merged.unfinished) {
         text += &paragraph(0, &clean(damage), is_wide);
     }
     let _ = writeln!(text, "written to {}", clean(&out.display().to_string()));
-    let json =
-        json!({ "out": out, "reference": merged.reference, "nodes": merged.nodes, "damage": merged.damage });
+    let json = json!({
+        "out": out, "reference": merged.reference, "nodes": merged.nodes, "damage": merged.damage,
+        "unfinished": merged.unfinished,
+    });
     Report { text, json, is_fine: merged.damage.is_empty() }
 }
 
@@ -277,13 +279,13 @@ fn micros(bound_ns: u64) -> String {
     format!("at most {:.1} us", bound_ns as f64 / 1e3)
 }
 
-fn exported(all: &[export::Exported], is_wide: bool) -> Report {
+fn exported(all: &export::Exports, is_wide: bool) -> Report {
     let mut table = Table::new(["FILE", "ROWS", "COLUMNS"]).wide(is_wide).whole(&["FILE"]);
-    for one in all {
+    for one in &all.files {
         table.row([one.file.display().to_string(), one.rows.to_string(), one.columns.to_string()]);
     }
     let mut text = table.text();
-    for one in all.iter().filter(|one| one.left_out > 0) {
+    for one in all.files.iter().filter(|one| one.left_out > 0) {
         let line = format!(
             "{}: {} values are in no column, because there are too many columns",
             clean(&one.topic),
@@ -291,5 +293,8 @@ fn exported(all: &[export::Exported], is_wide: bool) -> Report {
         );
         text += &paragraph(0, &line, is_wide);
     }
-    Report { text, json: json!({ "files": all }), is_fine: true }
+    for damage in all.damage.iter().chain(&all.unfinished) {
+        text += &paragraph(0, &clean(damage), is_wide);
+    }
+    Report { text, json: json!(all), is_fine: all.damage.is_empty() }
 }

@@ -98,7 +98,11 @@ pub(crate) fn show(order: &Order, arguments: &Arguments) -> Result<Report, Syste
     let playback = order.open()?;
     let mut target = Target::open(order, arguments)?;
     let played = session::play(order, playback, &mut target, &stop);
-    target.close();
+    let given_up = target.close();
+    let is_lost = played.as_ref().map_or(true, |played| matches!(played.end, session::End::Lost(_)));
+    if let Some(why) = given_up.filter(|_| is_lost) {
+        return Err(why);
+    }
     let played = played?;
     Ok(report::of(&played, arguments.wide))
 }

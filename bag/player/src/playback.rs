@@ -85,6 +85,7 @@ pub struct Playback {
     wall_offset_ns: i64,
     node: String,
     damage: Vec<String>,
+    missing_ends: Vec<String>,
     /// The request to stop.
     stop: Arc<AtomicBool>,
 }
@@ -120,6 +121,7 @@ impl Playback {
             wall_offset_ns: 0,
             node: String::new(),
             damage: Vec::new(),
+            missing_ends: Vec::new(),
             stop: Arc::default(),
         };
         let (mut known, mut parts, mut origin) = (BTreeMap::new(), BTreeSet::new(), None);
@@ -139,6 +141,7 @@ impl Playback {
             playback.wall_offset_ns = text("wall_offset_ns").parse().unwrap_or(0);
             playback.node = own.0;
             playback.damage.extend_from_slice(ordered.damage());
+            playback.missing_ends.extend(ordered.missing_end().map(str::to_owned));
             let mut ids = BTreeMap::new();
             for (id, channel) in ordered.channels() {
                 let Some(channel) = RecordedChannel::of(channel) else { continue };
@@ -177,6 +180,12 @@ impl Playback {
     #[must_use]
     pub fn damage(&self) -> &[String] {
         &self.damage
+    }
+
+    /// Returns a line for each unfinished file: from which byte and which time on messages may be missing.
+    #[must_use]
+    pub fn missing_ends(&self) -> &[String] {
+        &self.missing_ends
     }
 
     /// Leaves out the messages of all channels that do not satisfy the condition. To be called before the first message

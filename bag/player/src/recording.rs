@@ -41,6 +41,16 @@ pub enum RecordingError {
         "the recording has no message to compare: none that an application under test sent, or none of the type of its turns; record them, too"
     )]
     NothingSent,
+    /// All messages that could be read are the same, and others are damaged or missing.
+    #[error(
+        "all {messages} messages that can be compared are the same, and the recording is not whole: {damage}; give a whole recording, or read it with an earlier end"
+    )]
+    NotWhole {
+        /// The messages that were compared.
+        messages: usize,
+        /// The damage: the first line of [`Recording::damage`], and the number of the others.
+        damage: String,
+    },
     /// The applications did not reach the end, or sent other messages.
     #[error(transparent)]
     Check(#[from] CheckError),
@@ -75,6 +85,7 @@ const NAMES_SHOWN: usize = 20;
 #[derive(Clone, Debug)]
 pub struct Recording {
     order: CheckOrder,
+    damage: Vec<String>,
 }
 
 impl Recording {
@@ -99,10 +110,11 @@ impl Recording {
             channels.iter().filter_map(|channel| Some((channel.kind, channel.schema.clone()?))).collect();
         order.types = types.into_iter().collect();
         let wall_offset_ns = playback.wall_offset_ns();
-        let mut bytes = 0;
+        let (mut bytes, mut is_read_to_its_end) = (0, true);
         while let Some(message) = playback.next_message()? {
             let offset = Duration::from_nanos(playback.offset_ns(message.arrived_ns));
             if until.is_some_and(|until| offset > until) {
+                is_read_to_its_end = false;
                 break;
             }
             bytes += message.payload.len() as u64 + MESSAGE_BYTES;
@@ -111,7 +123,18 @@ impl Recording {
             }
             order.messages.push(recorded(message, wall_offset_ns));
         }
-        Ok(Self { order })
+        let mut damage = playback.damage().to_vec();
+        if is_read_to_its_end {
+            damage.extend_from_slice(playback.missing_ends());
+        }
+        Ok(Self { order, damage })
+    }
+
+    /// Returns a line for each damaged record of the files, and for each missing end that was to be read. A check
+    /// proves nothing about these messages.
+    #[must_use]
+    pub fn damage(&self) -> &[String] {
+        &self.damage
     }
 
     /// Ignores a field of all payloads, for example one with a time. A field of a field is `pose.t_ns`, an element of a
@@ -149,7 +172,8 @@ impl Recording {
     ///
     /// # Errors
     /// The recording has no message of an application of this name, the applications did not reach the end, or they
-    /// sent another message: the first one is named with the field and both values.
+    /// sent another message: the first one is named with the field and both values. Without such a difference, the
+    /// recording is damaged or has no end.
     pub fn check(&self, apps: impl IntoIterator<Item = DynApp>) -> Result<Checked, RecordingError> {
         let apps: Vec<_> = apps.into_iter().collect();
         for app in &apps {
@@ -158,7 +182,15 @@ impl Recording {
         let mut order = self.order.clone();
         order.apps = apps.iter().map(|app| app.name().to_owned()).collect();
         let checked = order.check(apps)?;
-        if checked.messages == 0 { Err(RecordingError::NothingSent) } else { Ok(checked) }
+        if checked.messages == 0 {
+            return Err(RecordingError::NothingSent);
+        }
+        let Some(first) = self.damage.first() else { return Ok(checked) };
+        let further = match self.damage.len() - 1 {
+            0 => String::new(),
+            further => format!(", and {further} further faults"),
+        };
+        Err(RecordingError::NotWhole { messages: checked.messages, damage: format!("{first}{further}") })
     }
 
     /// Returns the order for a program that `sinew play --check` starts. Without names all of its applications that the

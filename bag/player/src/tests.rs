@@ -216,6 +216,30 @@ fn end_of_a_check_is_that_of_its_messages() {
 }
 
 #[test]
+fn check_of_a_file_without_its_end_is_no_proof() {
+    let folder = TestFolder::new();
+    let path = walk(&folder, 0.3);
+    let bytes = fs::read(&path).unwrap();
+    // When: its end is cut off
+    fs::write(&path, &bytes[..bytes.len() - 20]).unwrap();
+    let recording = Recording::read(&[&path]).unwrap();
+    // Then
+    assert!(matches!(recording.damage(), [line] if line.contains("the file ends at byte")));
+    let error = recording.check([own(0.3).into()]).expect_err("it proves nothing about the rest");
+    assert!(
+        matches!(&error, RecordingError::NotWhole { messages: 1.., damage } if damage.contains("unfinished")),
+        "{error}"
+    );
+    // And: an end before that is proved
+    let recording = Recording::read_until(&[&path], Some(Duration::from_millis(10))).unwrap();
+    assert!(recording.damage().is_empty());
+    recording.check([own(0.3).into()]).expect("these messages are the same");
+    // And: a difference is named
+    let recording = Recording::read(&[&path]).unwrap();
+    assert!(matches!(recording.check([own(0.2).into()]), Err(RecordingError::Check(_))));
+}
+
+#[test]
 fn messages_are_in_the_order_of_sending() {
     let folder = TestFolder::new();
     let (mut bag, path) = bag(&folder, "walk.mcap", 2);

@@ -28,6 +28,8 @@ type Spans = BTreeMap<u64, (u64, u64)>;
 struct End {
     file: String,
     topic: String,
+    /// The address of this end's node.
+    own: String,
     /// The address of the node at the other end.
     other: String,
     labels: [String; 2],
@@ -39,20 +41,16 @@ struct End {
     /// The counter of each recording, by its incarnation and its begin. Each recording counts from zero, and its parts
     /// continue each other.
     dropped: BTreeMap<(u64, u64), u64>,
-    /// The send times of each file, with its clock.
-    sent: Vec<((Node, i64), SendTimes)>,
+    /// The send times of each file, with its clock and the begin of its recording.
+    sent: Vec<((Node, i64), u64, SendTimes)>,
 }
 
-impl End {
-    /// Returns the messages that no file of this end has, of all recordings together.
-    fn dropped(&self) -> u64 {
-        self.dropped.values().fold(0, |sum, dropped| sum.saturating_add(*dropped))
-    }
-}
+/// The recordings of each node with a given file, by its address.
+type Given = BTreeMap<String, Recordings>;
 
 /// Compares the ends, and names nodes without a given file.
 pub(super) fn compare(files: &mut [Checked], offsets: &Offsets, report: &mut Report) {
-    let mut given: BTreeMap<String, Recordings> = BTreeMap::new();
+    let mut given = Given::new();
     for file in files.iter() {
         let recordings = given.entry(file.report.address.clone()).or_default();
         if let Some(span_ns) = file.span_ns() {
@@ -87,9 +85,11 @@ pub(super) fn compare(files: &mut [Checked], offsets: &Offsets, report: &mut Rep
         let mut other = received.remove(&key).unwrap_or_default();
         other.sequences.settle();
         if other.sequences.len() == 0 {
-            none_received(&key, &end, &other, &place(&end, recordings, offsets), report);
+            let placed = place(&end, recordings, &given, offsets);
+            let dropped = recordings.sum(other.dropped.iter().map(|(recording, count)| (*recording, *count)));
+            none_received(&key, &end, &other, (&placed, dropped), report);
         } else {
-            both(&key, &end, &other, report);
+            both(&key, &end, &other, &given, report);
         }
     }
 }
@@ -112,7 +112,8 @@ fn collect(file: &mut Checked, sent: &mut BTreeMap<Key, End>, received: &mut BTr
             continue;
         }
         let end = ends.entry(key(&channel)).or_default();
-        (end.file, end.topic, end.other) = (file.report.file.clone(), topic.clone(), other.to_owned());
+        (end.file, end.topic) = (file.report.file.clone(), topic.clone());
+        (end.own, end.other) = (own.clone(), other.to_owned());
         end.labels = ["source", "destination"].map(|role| label(&channel, role));
         let type_name = channel.value("type");
         if end.type_name.is_empty() || type_name != nameless(channel.value("kind")) {
@@ -127,19 +128,29 @@ fn collect(file: &mut Checked, sent: &mut BTreeMap<Key, End>, received: &mut BTr
         end.sequences.absorb(std::mem::take(&mut counted.sequences));
         let dropped = end.dropped.entry((file.report.incarnation, file.report.began_ns)).or_default();
         *dropped = counted.last.dropped.max(*dropped);
-        end.sent.push((clock.clone(), std::mem::take(&mut counted.sent)));
+        end.sent.push((clock.clone(), file.report.began_ns, std::mem::take(&mut counted.sent)));
     }
 }
 
 /// Compares the send times of all files with the recordings of the receiver.
-fn place(sent: &End, recordings: &Recordings, offsets: &Offsets) -> Placed {
-    let mut sum = Placed::default();
-    for ((node, offset_ns), times) in &sent.sent {
+fn place(sent: &End, recordings: &Recordings, given: &Given, offsets: &Offsets) -> Placed {
+    let mut parts: BTreeMap<(u64, u64), Placed> = BTreeMap::new();
+    for ((node, offset_ns), began_ns, times) in &sent.sent {
         let placed = recordings.place((node, *offset_ns), times, &sent.other, offsets);
+        let sum = parts.entry((node.1, *began_ns)).or_default();
         sum.within += placed.within;
         sum.after += placed.after;
         sum.has_no_clock |= placed.has_no_clock;
     }
+    let sum_of = |count: fn(&Placed) -> u64| {
+        let counts = parts.iter().map(|(recording, placed)| (*recording, count(placed)));
+        given.get(&sent.own).map_or(0, |own| own.sum(counts))
+    };
+    let mut sum = Placed {
+        within: sum_of(|placed| placed.within),
+        after: sum_of(|placed| placed.after),
+        has_no_clock: parts.values().any(|placed| placed.has_no_clock),
+    };
     // Two files of one node may have the same message.
     let count = sent.sequences.len();
     sum.within = sum.within.min(count);
@@ -184,12 +195,18 @@ fn find(kind: Kind, end: &End, text: String, report: &mut Report) {
 }
 
 /// Reports a channel of which the receiver's files have no message: only those are lost that were sent while it
-/// recorded.
-fn none_received(key: &Key, sent: &End, received: &End, placed: &Placed, report: &mut Report) {
+/// recorded, and that it did not count as dropped.
+fn none_received(
+    key: &Key,
+    sent: &End,
+    received: &End,
+    (placed, dropped): (&Placed, u64),
+    report: &mut Report,
+) {
     let mut end = describe(key, sent, received);
     end.after = placed.after;
     end.before = end.sent - placed.within - placed.after;
-    end.not_recorded = placed.within.min(received.dropped());
+    end.not_recorded = placed.within.min(dropped);
     let lost = placed.within - end.not_recorded;
     if lost > 0 {
         let when = if placed.has_no_clock {
@@ -205,7 +222,36 @@ fn none_received(key: &Key, sent: &End, received: &End, placed: &Placed, report:
     report.ends.push(end);
 }
 
-fn both(key: &Key, sent: &End, received: &End, report: &mut Report) {
+/// Returns how many of these numbers, in their order, the recordings of an end can have dropped. Where recordings
+/// overlap in time, each that has both earlier and later messages must have dropped the number.
+fn excused(end: &End, given: &Given, numbers: impl Iterator<Item = u64>) -> u64 {
+    let groups = given.get(&end.own).map(Recordings::groups).unwrap_or_default();
+    let mut left: BTreeMap<usize, Vec<((u64, u64), u64)>> = BTreeMap::new();
+    for (incarnation, spans) in &end.incarnations {
+        for (began_ns, span) in spans {
+            let recording = (*incarnation, *began_ns);
+            // One without a tally has counted nothing.
+            let Some(group) = groups.get(&recording) else { continue };
+            let dropped = end.dropped.get(&recording).copied().unwrap_or(0);
+            left.entry(*group).or_default().push((*span, dropped));
+        }
+    }
+    numbers.filter(|number| left.values_mut().any(|group| excuse(group, *number))).count() as u64
+}
+
+/// Takes the number from the counters of dropped messages of all recordings of a group that it lies within. Returns
+/// `false` if there is none, or if one has no dropped message left.
+fn excuse(group: &mut [((u64, u64), u64)], number: u64) -> bool {
+    let has = |((first, last), _): &((u64, u64), u64)| (*first..=*last).contains(&number);
+    let mut within = group.iter().filter(|one| has(one)).peekable();
+    if within.peek().is_none() || within.any(|(_, left)| *left == 0) {
+        return false;
+    }
+    group.iter_mut().filter(|one| has(one)).for_each(|(_, left)| *left -= 1);
+    true
+}
+
+fn both(key: &Key, sent: &End, received: &End, given: &Given, report: &mut Report) {
     let Some(last) = received.sequences.last() else { return };
     let mut end = describe(key, sent, received);
     let is_stream = end.class == "Stream";
@@ -214,7 +260,7 @@ fn both(key: &Key, sent: &End, received: &End, report: &mut Report) {
     end.after = missing().filter(|number| *number > last).count() as u64;
     let within = missing().filter(was_recorded).count() as u64;
     end.before = missing().count() as u64 - end.after - within;
-    end.not_recorded = within.min(received.dropped());
+    end.not_recorded = excused(received, given, missing().filter(was_recorded));
     let lost = within - end.not_recorded;
     if is_stream {
         end.superseded_or_lost = lost;
@@ -235,7 +281,7 @@ fn both(key: &Key, sent: &End, received: &End, report: &mut Report) {
         |number: &u64| has_any && sent.incarnations.values().all(|spans| lies_within(spans, *number));
     let unsent = || received.sequences.without(&sent.sequences).filter(is_known);
     let count = unsent().count() as u64;
-    if count > sent.dropped() {
+    if count > excused(sent, given, unsent()) {
         let numbers = ranges(unsent(), SPANS_MAX);
         find(
             Kind::Unsent,

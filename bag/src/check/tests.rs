@@ -7,7 +7,7 @@ use super::*;
 use crate::{
     BagWriter, Class, Direction, Options, Origin,
     read::{Item, Reader},
-    testing::{TestFolder, channel, record, typed_channel},
+    testing::{TestFolder, channel, chunks, record, typed_channel},
 };
 
 const SECOND: u64 = 1_000_000_000;
@@ -382,10 +382,55 @@ fn dropped_messages_of_all_recordings_count_together() {
 }
 
 #[test]
+fn dropped_messages_of_overlapping_recordings_count_once() {
+    // Given: a receiver with two recordings at the same time. Both have dropped 11 to 13, and 21 to 23 have not arrived
+    let folder = TestFolder::new();
+    let files = ["one.mcap", "first.mcap", "second.mcap"].map(|name| folder.path(name));
+    incarnation(&files[0], ("127.0.0.2", 1), Direction::Sent, 1..=80);
+    for began in [1, 2] {
+        let origin = Origin { began_ns: began * 1_000, ..origin("127.0.0.3") };
+        let mut bag = BagWriter::create(&files[began as usize], Options::default(), origin).unwrap();
+        let channel = channel(&mut bag, Class::Control, Direction::Received);
+        for (at, sequence) in (1..).zip((1..=80).filter(|sequence| !(21..=23).contains(sequence))) {
+            if (11..=13).contains(&sequence) {
+                bag.dropped(channel, 1, (at * SECOND / 10, at * SECOND / 10)).unwrap();
+            } else {
+                let message = crate::Record { sequence, ..record(at, at * SECOND / 10) };
+                bag.message(channel, &message).unwrap();
+            }
+        }
+        bag.finish(60 * SECOND).unwrap();
+    }
+    // Then
+    let report = check(&files).unwrap();
+    assert_eq!((report.ends[0].not_recorded, report.ends[0].lost), (3, 3), "{:#?}", report.findings);
+    assert!(!report.is_fine());
+}
+
+#[test]
+fn receiver_without_a_tally_proves_nothing() {
+    let folder = TestFolder::new();
+    let [one, other] = ["one.mcap", "other.mcap"].map(|name| folder.path(name));
+    sent(&one);
+    recording(&other, "127.0.0.3", Class::Control, Direction::Received, |_| false);
+    let forged = forge(&other, |topic, _, data| (topic != "/sinew/tally").then(|| data.to_vec()));
+    let found = findings(&[&one, &forged]);
+    assert!(
+        matches!(&found[..], [(Kind::NoTally, text)] if text.starts_with("not provable: no tally")),
+        "{found:?}"
+    );
+}
+
+#[test]
 fn merged_file_is_refused_with_names_of_its_files() {
     let folder = TestFolder::new();
     let files = ["one.mcap", "again.mcap"].map(|name| folder.path(name));
-    files.iter().for_each(|path| sent(path));
+    for (path, address) in files.iter().zip(["127.0.0.2", "127.0.0.3"]) {
+        let mut bag = BagWriter::create(path, Options::default(), origin(address)).unwrap();
+        let reading = crate::ClockReading { peer: "127.0.0.2".into(), incarnation: 1, ..Default::default() };
+        bag.clock(SECOND, &reading).unwrap();
+        bag.finish(2 * SECOND).unwrap();
+    }
     let out = folder.path("all.mcap");
     crate::merge(&files, &out).unwrap();
     let fault = check(&[out]).unwrap_err().to_string();
@@ -411,16 +456,7 @@ fn damaged_chunk_is_named_and_the_rest_is_read() {
     let path = folder.path("walk.mcap");
     sent(&path);
     let bytes = fs::read(&path).unwrap();
-    // The places of all records, without the magic bytes at both ends.
-    let (mut at, mut chunks) = (8, Vec::new());
-    while at < bytes.len() - 8 {
-        let length = u64::from_le_bytes(bytes[at + 1..at + 9].try_into().unwrap()) as usize;
-        if bytes[at] == 0x06 {
-            chunks.push((at, length));
-        }
-        at += 9 + length;
-    }
-    let (at, length) = chunks[2];
+    let (at, length) = chunks(&bytes)[2];
     let found = |changed: usize| {
         let mut bytes = bytes.clone();
         bytes[changed] ^= 0x40;

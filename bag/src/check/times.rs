@@ -82,6 +82,41 @@ impl Recordings {
         *span = (span.0.min(first_ns), span.1.max(last_ns));
     }
 
+    /// Returns the group of each recording. Recordings of one incarnation that overlap in time are in one group: they
+    /// had the same messages.
+    pub(super) fn groups(&self) -> BTreeMap<(u64, u64), usize> {
+        let mut all: Vec<_> =
+            self.0.iter().map(|(recording, span)| (recording.0, *span, *recording)).collect();
+        all.sort_unstable();
+        let (mut groups, mut group, mut before) = (BTreeMap::new(), 0, None);
+        for (incarnation, (first_ns, last_ns), recording) in all {
+            before = match before {
+                Some((same, end_ns)) if same == incarnation && first_ns <= end_ns => {
+                    Some((incarnation, last_ns.max(end_ns)))
+                }
+                Some(_) | None => {
+                    group += 1;
+                    Some((incarnation, last_ns))
+                }
+            };
+            groups.insert(recording, group);
+        }
+        groups
+    }
+
+    /// Returns the sum of the counts of all recordings. Of those that overlap in time only the largest count is added.
+    pub(super) fn sum(&self, counts: impl Iterator<Item = ((u64, u64), u64)>) -> u64 {
+        let groups = self.groups();
+        let mut largest: BTreeMap<usize, u64> = BTreeMap::new();
+        for (recording, count) in counts {
+            // Those without a tally have no time: they may overlap.
+            let group = groups.get(&recording).copied().unwrap_or(0);
+            let known = largest.entry(group).or_default();
+            *known = count.max(*known);
+        }
+        largest.into_values().fold(0, u64::saturating_add)
+    }
+
     /// Compares the messages that `from` sent, by a wall clock that is `offset_ns` ahead of its monotonic clock, with
     /// the recordings of the node at `address`.
     pub(super) fn place(
@@ -146,5 +181,18 @@ mod tests {
             "no message is between two blocks"
         );
         assert_eq!(times.blocks.last().map(|block| block.last_ns), Some(10_000));
+    }
+
+    #[test]
+    fn counts_of_overlapping_recordings_are_not_added() {
+        let mut recordings = Recordings::default();
+        // Given: two that overlap, a third behind them, and one of a later incarnation
+        for (recording, span) in
+            [((1, 10), (10, 50)), ((1, 20), (20, 90)), ((1, 95), (95, 99)), ((2, 5), (5, 9))]
+        {
+            recordings.add(recording, span);
+        }
+        let counts = [((1, 10), 3), ((1, 20), 4), ((1, 95), 5), ((2, 5), 6)];
+        assert_eq!(recordings.sum(counts.into_iter()), 4 + 5 + 6);
     }
 }

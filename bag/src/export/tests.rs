@@ -6,7 +6,7 @@ use parquet::{
 use super::*;
 use crate::{
     BagWriter, ChannelInfo, Class, Direction, Options, Origin, Party, Record,
-    testing::{TestFolder, angle},
+    testing::{TestFolder, angle, chunks, record},
 };
 
 /// A recording with these payloads.
@@ -52,7 +52,7 @@ fn protected_payload_has_the_columns_of_its_value() {
     let sealed = [&[1; 32][..], b"\x81\xa1x\x05", &[9; 8]].concat();
     bag.message(channel, &Record { number: 1, sequence: 1, payload: &sealed, ..Record::default() }).unwrap();
     bag.finish(10).unwrap();
-    let exported = export(&path, folder.path("out"), Format::Csv).unwrap();
+    let exported = export(&path, folder.path("out"), Format::Csv).unwrap().files;
     let text = fs::read_to_string(&exported[0].file).unwrap();
     let heading = text.lines().next().unwrap();
     assert!(heading.split(',').any(|column| column == "x"), "{text}");
@@ -69,7 +69,7 @@ fn text_has_a_column_for_each_value() {
             serde_json::json!({ "degrees": -3, "log_ns": 7, "big": u64::MAX }),
         ],
     );
-    let exported = export(&path, folder.path("out"), Format::Csv).unwrap();
+    let exported = export(&path, folder.path("out"), Format::Csv).unwrap().files;
     assert_eq!((exported[0].rows, exported[0].columns), (2, 14));
     assert!(exported[0].file.ends_with("knee.sensor__exo.angle.csv"));
     let text = fs::read_to_string(&exported[0].file).unwrap();
@@ -93,7 +93,7 @@ fn parquet_keeps_types() {
             serde_json::json!({ "big": 0, "low": 1, "mixed": 0.5, "odd": "one" }),
         ],
     );
-    let exported = export(&path, folder.path("out"), Format::Parquet).unwrap();
+    let exported = export(&path, folder.path("out"), Format::Parquet).unwrap().files;
     let reader = SerializedFileReader::new(fs::File::open(&exported[0].file).unwrap()).unwrap();
     let rows: Vec<Vec<(String, Field)>> =
         reader.get_row_iter(None).unwrap().map(|row| row.unwrap().into_columns()).collect();
@@ -120,4 +120,38 @@ fn payload_with_nested_keys_or_long_paths_stays_whole() {
         assert_eq!(described.len(), columns::FIXED.len() + 1);
         assert_eq!(described[columns::FIXED.len()].0, "bytes");
     }
+}
+
+#[test]
+fn loss_of_damaged_recording_is_named() {
+    let folder = TestFolder::new();
+    let path = folder.path("walk.mcap");
+    let options = Options { chunk_bytes: 1_024, ..Options::default() };
+    let mut bag = BagWriter::create(&path, options, Origin::default()).unwrap();
+    let channel = angle(&mut bag, Direction::Sent);
+    (1..=60).for_each(|number| bag.message(channel, &record(number, number * 100_000_000)).unwrap());
+    bag.finish(7_000_000_000).unwrap();
+    let whole = fs::read(&path).unwrap();
+    let exported = |bytes: &[u8], out: &str| {
+        fs::write(&path, bytes).unwrap();
+        let exports = export(&path, folder.path(out), Format::Csv).unwrap();
+        (exports.files[0].rows, exports.damage, exports.unfinished)
+    };
+    assert_eq!(exported(&whole, "whole"), (60, Vec::new(), None));
+    // When: the file is cut off in the middle of a chunk
+    let (rows, damage, unfinished) = exported(&whole[..chunks(&whole)[4].0 + 20], "cut");
+    let unfinished = unfinished.expect("the end is missing");
+    assert!(rows > 0 && rows < 60 && damage.is_empty(), "{rows}: {damage:?}");
+    let is_named = unfinished.contains("the file ends at byte ") && unfinished.contains("messages after ");
+    assert!(is_named, "{unfinished}");
+    // When: a byte of a chunk is changed
+    let (at, length) = chunks(&whole)[2];
+    let mut changed = whole.clone();
+    changed[at + 9 + length / 2] ^= 0x40;
+    let (rows, damage, unfinished) = exported(&changed, "changed");
+    assert!(rows > 0 && rows < 60 && unfinished.is_none(), "{rows}: {unfinished:?}");
+    assert!(
+        matches!(&damage[..], [line] if line.contains("its messages, from ") && line.contains(&format!("at byte {at}"))),
+        "{damage:?}"
+    );
 }

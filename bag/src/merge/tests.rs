@@ -111,3 +111,49 @@ fn node_without_a_clock_reading_is_named() {
     let fault = merge(&files, folder.path("all.mcap")).unwrap_err().to_string();
     assert!(fault.contains("connects its node b with a"), "{fault}");
 }
+
+#[test]
+fn recording_that_is_given_twice_is_refused() {
+    let folder = TestFolder::new();
+    let path = write(&folder, "a", 0, 0, None);
+    let copy = folder.path("copy.mcap");
+    fs::copy(&path, &copy).unwrap();
+    for second in [&path, &copy] {
+        let out = folder.path("all.mcap");
+        let fault = merge(&[&path, second], &out).unwrap_err().to_string();
+        let words = format!("{} and {} are the same part", path.display(), second.display());
+        assert!(fault.starts_with(&words), "{fault}");
+        assert!(!out.exists());
+    }
+    // And: a later recording of the same node is another one
+    let later = folder.path("later.mcap");
+    let origin =
+        Origin { node: "a".into(), address: "a".into(), incarnation: 1, began_ns: 9, ..Origin::default() };
+    BagWriter::create(&later, Options::default(), origin).unwrap().finish(10).unwrap();
+    merge(&[&path, &later], folder.path("all.mcap")).unwrap();
+}
+
+#[test]
+fn loss_of_a_merged_file_is_known_later() {
+    let folder = TestFolder::new();
+    let files = [
+        write(&folder, "a", 0, 0, Some(("b", 60 * SECOND as i64))),
+        write(&folder, "b", 60 * SECOND as i64, 0, None),
+    ];
+    let losses = |out: &str| {
+        let out = folder.path(out);
+        merge(&files, &out).unwrap();
+        let merged = Ordered::open(&out).unwrap();
+        assert_eq!(merged.missing_end(), None);
+        merged.damage().to_vec()
+    };
+    assert_eq!(losses("whole.mcap"), [""; 0]);
+    // When: the end of one file is cut off
+    let bytes = fs::read(&files[1]).unwrap();
+    fs::write(&files[1], &bytes[..bytes.len() - 20]).unwrap();
+    let found = losses("cut.mcap");
+    assert!(
+        matches!(&found[..], [loss] if loss.contains("cut.mcap: one of the files") && loss.contains("b.mcap: unfinished")),
+        "{found:?}"
+    );
+}

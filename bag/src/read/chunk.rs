@@ -4,6 +4,12 @@ use std::io::Read as _;
 
 use super::frames::{Body, CHUNK_MAX};
 
+/// Returns the times of the first and the last message that a chunk states, in nanoseconds of the file's wall clock.
+pub(super) fn times(chunk: &[u8]) -> Option<(u64, u64)> {
+    let mut body = Body(chunk);
+    Some((body.u64()?, body.u64()?))
+}
+
 /// Decompresses the records of a chunk into `records`, and checks their checksum.
 pub(super) fn records(chunk: &[u8], records: &mut Vec<u8>) -> Result<(), String> {
     records.clear();

@@ -9,8 +9,11 @@ use std::{
     sync::Arc,
 };
 
-use super::{Channel, End, Item, Reader, chunk, frames};
-use crate::error::{BagError, DamageList};
+use super::{Channel, Item, Reader, chunk, frames};
+use crate::{
+    error::{BagError, DamageList},
+    merge::{LOSSES_MAX, MERGED, MERGED_LOSSES},
+};
 
 /// Maximum bytes of chunks that overlap in time and so are in memory together.
 const OVERLAP_MAX: u64 = 1 << 30;
@@ -45,7 +48,7 @@ pub struct Ordered {
     file: BufReader<File>,
     channels: BTreeMap<u16, Arc<Channel>>,
     metadata: BTreeMap<String, BTreeMap<String, String>>,
-    end: End,
+    missing_end: Option<String>,
     damage: Vec<String>,
     /// The chunks that are not loaded, the earliest last.
     waiting: Vec<Span>,
@@ -99,6 +102,13 @@ impl Ordered {
             }
         }
         let mut damage = damage.into_lines(path);
+        // What was missing before is missing now.
+        let losses =
+            metadata.get(MERGED).and_then(|fields: &BTreeMap<String, String>| fields.get(MERGED_LOSSES));
+        let losses = losses.map_or("", String::as_str).lines().take(LOSSES_MAX);
+        damage.extend(losses.map(|loss| {
+            format!("{}: one of the files that it was made of was not whole: {loss}", path.display())
+        }));
         if outside > 0 {
             damage.push(format!("{}: {outside} messages outside of chunks are left out", path.display()));
         }
@@ -110,7 +120,7 @@ impl Ordered {
             file: BufReader::new(file),
             channels: reader.channels().clone(),
             metadata,
-            end: reader.end(),
+            missing_end: reader.missing_end(),
             damage,
             waiting,
             loaded: BTreeMap::new(),
@@ -130,13 +140,14 @@ impl Ordered {
         self.metadata.get(name)
     }
 
-    /// Returns how the file ended.
+    /// Returns the loss at the end of an unfinished file, as [`Reader::missing_end`] does.
     #[must_use]
-    pub const fn end(&self) -> End {
-        self.end
+    pub fn missing_end(&self) -> Option<&str> {
+        self.missing_end.as_deref()
     }
 
-    /// Returns the damage that was found, and skipped: the first 1,000 records, and the number of the others.
+    /// Returns the damage that was found, and skipped: the first 1,000 records, and the number of the others. A merged
+    /// file also has the losses of the files that it was made of.
     #[must_use]
     pub fn damage(&self) -> &[String] {
         &self.damage

@@ -49,6 +49,7 @@ pub(crate) fn show(order: &Order, stop: &StopRequest) -> Result<Report, SystemEr
     if let Some(name) = &order.turns {
         recording = recording.turns(name);
     }
+    let damage = recording.damage().to_vec();
     let request = recording.into_order(&order.apps)?;
     let names: BTreeMap<u64, String> = request.names.iter().map(|(name, tid)| (*tid, name.clone())).collect();
     let folder = Folder::new()?;
@@ -60,8 +61,10 @@ pub(crate) fn show(order: &Order, stop: &StopRequest) -> Result<Report, SystemEr
     let report = exchange::read::<CheckReport>(&folder.0.join(exchange::REPORT), exchange::REPORT_BYTES_MAX);
     let Ok(report) = report else { return Err(SystemError::Bag(unreported(order, &folder, status))) };
     match report {
-        CheckReport::Identical { messages, sources, misfits } => Ok(identical(messages, sources, &misfits)),
-        CheckReport::Differs(difference) => Ok(differs(&difference, &names)),
+        CheckReport::Identical { messages, sources, misfits } => {
+            Ok(identical(messages, sources, &misfits, &damage))
+        }
+        CheckReport::Differs(difference) => Ok(differs(&difference, &names, &damage)),
         CheckReport::Failed(why) => {
             Err(SystemError::Bag(format!("the check did not reach its end: {}", clean(&why))))
         }
@@ -167,31 +170,41 @@ fn declared(folder: &Path) -> String {
     format!("No application of it is in the recording under this name, or was chosen by --app: {lines}")
 }
 
-fn identical(messages: u64, sources: u64, misfits: &[String]) -> Report {
-    let mut text = format!("identical: {messages} messages of {sources} sources\n");
-    for misfit in misfits {
-        text += &format!("{}\n", clean(misfit));
+fn identical(messages: u64, sources: u64, misfits: &[String], damage: &[String]) -> Report {
+    let (word, result, end) = if damage.is_empty() {
+        ("identical", "identical", "")
+    } else {
+        ("not whole", "not_whole", "are identical; those that the recording lacks are not compared")
+    };
+    let line = format!("{word}: {messages} messages of {sources} sources {end}");
+    let mut text = format!("{}\n", line.trim_end());
+    for line in misfits.iter().chain(damage) {
+        text += &format!("{}\n", clean(line));
     }
-    let json = json!({ "result": "identical", "messages": messages, "sources": sources, "misfits": misfits });
-    Report { text, json, is_fine: true }
+    let json = json!({
+        "result": result, "messages": messages, "sources": sources, "misfits": misfits, "damage": damage,
+    });
+    Report { text, json, is_fine: damage.is_empty() }
 }
 
-fn differs(difference: &ReportedDifference, names: &BTreeMap<u64, String>) -> Report {
+fn differs(difference: &ReportedDifference, names: &BTreeMap<u64, String>, damage: &[String]) -> Report {
     let ReportedDifference { source, number, at_ns, type_name, destination, difference, misfit } = difference;
     let shown = |tid: u64| names.get(&tid).cloned().unwrap_or_else(|| Tid::from_bits(tid).to_string());
     let (source, destination) = (shown(*source), shown(*destination));
-    let seconds = *at_ns as f64 / 1e9;
+    // As in the other lines of the report.
+    let at = Time::from_nanos(*at_ns);
     let line = format!(
-        "the first difference: message {number} of {source}, {type_name} to {destination} at {seconds:.6} s: \
+        "the first difference: message {number} of {source}, {type_name} to {destination} at {at:?}: \
          {difference}"
     );
     let mut text = format!("{}\n", clean(&line));
-    if let Some(misfit) = misfit {
-        text += &format!("{}\n", clean(misfit));
+    for line in misfit.iter().chain(damage) {
+        text += &format!("{}\n", clean(line));
     }
     let json = json!({
         "result": "differs", "source": source, "number": number, "at_ns": at_ns, "type": type_name,
         "destination": destination, "difference": difference, "misfit": misfit,
+        "damage": damage,
     });
     Report { text, json, is_fine: false }
 }
@@ -209,13 +222,24 @@ mod tests {
             type_name: "demo.torque".to_owned(),
             destination: Tid::from_bits(0x0a00_0002_0000_1001).bits(),
             difference: "`newton_metres` was 5.0 and is 2.5".to_owned(),
-            misfit: None,
+            misfit: Some("2 recorded messages, the first at 1.500000000s".to_owned()),
         };
-        let report = differs(&difference, &BTreeMap::from([(5, "knee".to_owned())]));
-        let expected = "the first difference: message 7 of knee, demo.torque to 10.0.0.2/1001 at 1.500000 s: \
-                        `newton_metres` was 5.0 and is 2.5\n";
+        let report = differs(&difference, &BTreeMap::from([(5, "knee".to_owned())]), &[]);
+        let expected = "the first difference: message 7 of knee, demo.torque to 10.0.0.2/1001 at 1.500000000s: \
+                        `newton_metres` was 5.0 and is 2.5\n2 recorded messages, the first at 1.500000000s\n";
         assert_eq!((report.text.as_str(), report.is_fine), (expected, false));
         assert_eq!(report.json["source"], "knee");
+    }
+
+    #[test]
+    fn check_of_a_damaged_recording_is_no_proof() {
+        let whole = identical(7, 2, &[], &[]);
+        assert_eq!((whole.text.as_str(), whole.is_fine), ("identical: 7 messages of 2 sources\n", true));
+        let damage = ["walk.mcap: unfinished: the file ends at byte 9".to_owned()];
+        let cut = identical(7, 2, &[], &damage);
+        assert!(!cut.is_fine && cut.text.starts_with("not whole: 7 messages"), "{}", cut.text);
+        assert!(cut.text.contains(&damage[0]), "{}", cut.text);
+        assert_eq!((&cut.json["result"], &cut.json["damage"][0]), (&json!("not_whole"), &json!(damage[0])));
     }
 
     #[test]

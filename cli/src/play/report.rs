@@ -28,6 +28,14 @@ pub(crate) fn of(played: &Played, is_wide: bool) -> Report {
             names.join(", ")
         ));
     }
+    if !played.own.is_empty() {
+        let names: Vec<_> = played.own.iter().take(SHOWN_MAX).map(String::as_str).collect();
+        line(&format!(
+            "not there: {}; this command plays these sources itself. Where a program of that name is to receive, choose \
+             the other sources: --source",
+            names.join(", ")
+        ));
+    }
     if !played.lost.is_empty() {
         let nodes: Vec<_> = played.lost.iter().take(SHOWN_MAX).map(ToString::to_string).collect();
         let nodes = nodes.join(", ");
@@ -38,7 +46,7 @@ pub(crate) fn of(played: &Played, is_wide: bool) -> Report {
     for (why, count) in played.reasons.iter().take(SHOWN_MAX) {
         line(&format!("rejected: {count}: {why}"));
     }
-    played.damage.iter().take(SHOWN_MAX).for_each(|damage| line(damage));
+    played.damage.iter().chain(&played.missing_ends).take(SHOWN_MAX).for_each(|damage| line(damage));
     if let End::Lost(why) = &played.end {
         line(&format!("ended early: the node is lost: {why}"));
     }
@@ -91,8 +99,10 @@ fn json_of(played: &Played, total: &Row) -> serde_json::Value {
     json!({
         "project": played.project, "own_node": played.is_own, "end": end, "passes": played.passes,
         "sources": played.sources, "sent": total.sent, "rejected": total.rejected, "late": total.late,
-        "absent": total.absent, "not_there": played.absent, "left_out": left_out, "reasons": played.reasons,
+        "absent": total.absent, "not_there": played.absent, "played_itself": played.own, "left_out": left_out,
+        "reasons": played.reasons,
         "channels": channels.collect::<Vec<_>>(), "damage": played.damage,
+        "missing_ends": played.missing_ends,
         "lost_nodes": played.lost.iter().map(ToString::to_string).collect::<Vec<_>>(),
     })
 }
@@ -117,8 +127,10 @@ mod tests {
             rows: vec![row, silent],
             left_out: BTreeMap::from([(LeftOut::Protected, 3)]),
             absent: BTreeSet::from(["knee".to_owned()]),
+            own: BTreeSet::from(["hip".to_owned()]),
             reasons: BTreeMap::new(),
             damage: Vec::new(),
+            missing_ends: Vec::new(),
             lost: BTreeSet::new(),
         }
     }
@@ -127,7 +139,12 @@ mod tests {
     fn left_out_commands_are_reported_with_their_count() {
         let report = of(&played(), false);
         assert!(report.is_fine, "{}", report.text);
-        for words in ["left out: 3 protected commands", "not there: knee", "9 messages of 1 sources sent"] {
+        for words in [
+            "left out: 3 protected commands",
+            "not there: knee",
+            "not there: hip; this command plays",
+            "9 messages of 1 sources sent",
+        ] {
             assert!(report.text.contains(words), "{words}: {}", report.text);
         }
         assert!(!report.text.contains("demo.never"), "{}", report.text);

@@ -36,7 +36,7 @@ pub(crate) struct Row {
     pub(crate) rejected: u64,
     /// Messages that were sent later than they were due.
     pub(crate) late: u64,
-    /// Messages to an application that is not there.
+    /// Messages to an application that is not there, or that this command plays itself: no program receives them.
     pub(crate) absent: u64,
 }
 
@@ -64,9 +64,13 @@ pub(crate) struct Played {
     pub(crate) left_out: BTreeMap<LeftOut, u64>,
     /// Names of destinations that were not there.
     pub(crate) absent: BTreeSet<String>,
+    /// Names of destinations that this command plays itself.
+    pub(crate) own: BTreeSet<String>,
     /// Reasons of rejections, each with its number. A reason is one of a few.
     pub(crate) reasons: BTreeMap<String, u64>,
     pub(crate) damage: Vec<String>,
+    /// The unfinished files: a killed recorder leaves one, and its messages are played.
+    pub(crate) missing_ends: Vec<String>,
     /// Nodes that were lost when the names were compared, at most as many as a node reports.
     pub(crate) lost: BTreeSet<NodeAddress>,
 }
@@ -100,8 +104,10 @@ pub(crate) fn play(
             rows: topics.collect(),
             left_out: BTreeMap::new(),
             absent: BTreeSet::new(),
+            own: BTreeSet::new(),
             reasons: BTreeMap::new(),
             damage: playback.damage().to_vec(),
+            missing_ends: playback.missing_ends().to_vec(),
             lost: lost.into_iter().collect(),
         },
         due: 0,
@@ -291,6 +297,13 @@ impl Session<'_> {
             }
             return Ok(());
         };
+        if let To::Name(name) = &route.to
+            && sources.has(to)
+        {
+            row.absent += 1;
+            self.played.own.insert(name.clone());
+            return Ok(());
+        }
         row.late += u64::from(Pace::is_late(due, now));
         match sources.send(&route.sender, to, message) {
             Ok(()) => {

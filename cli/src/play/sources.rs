@@ -70,6 +70,11 @@ impl Sources {
         self.0.values().map(Endpoint::tid).collect()
     }
 
+    /// Returns whether one of them has this address.
+    pub(crate) fn has(&self, tid: Tid) -> bool {
+        self.0.values().any(|endpoint| endpoint.tid() == tid)
+    }
+
     /// Sends a message as one of these applications.
     pub(crate) fn send(&mut self, sender: &Sender, to: Tid, message: &Recorded) -> Result<(), ApiError> {
         let endpoint = self.0.get_mut(sender).expect("all senders of the recording are registered");

@@ -7,16 +7,20 @@ use std::{
 };
 
 use sinew::{
-    Node, NodeApi,
+    Node, NodeApi, StartError,
     config::{LogLevel, NodeConfig},
+    node::NodeEnd,
 };
 
 use super::{Order, sources::SOURCES_MAX};
 use crate::{
     arguments::Arguments,
     system::{System, SystemError},
+    table::clean,
 };
 
+/// The name of the own node.
+const NAME: &str = "sinew-play";
 /// The address of the own node. Nodes of users on loopback have those that begin with 127.0.0.
 const ADDRESS: [u8; 4] = [127, 0, 83, 119];
 /// Connections to the own node: one for each source, and some for the command itself and for others.
@@ -51,16 +55,21 @@ impl Target {
             config.lncl.clients_per_process_max = CLIENTS_MAX;
             config.lncl.socket = Some(socket.clone());
         };
-        let node = Node::builder("sinew-play").address(ADDRESS).configure(configure).start();
+        let node = Node::builder(NAME).address(ADDRESS).configure(configure).start();
         let node = node.map_err(|why| {
-            let project = &order.project;
-            SystemError::Bag(format!(
-                "the node for the recording did not start: {why}. If another `sinew play` runs in the project \
-                 {project}, choose another one: --project {project}-2"
-            ))
+            if let StartError::AddressTaken(words) = &why {
+                gave_up(&project, words)
+            } else {
+                SystemError::Bag(format!("the node for the recording did not start: {why}"))
+            }
         })?;
-        let system = System::enter(Some(&socket), arguments.within())?;
-        Ok(Self { system, project, own: Some(node) })
+        match System::enter(Some(&socket), arguments.within()) {
+            Ok(system) => Ok(Self { system, project, own: Some(node) }),
+            Err(why) => Err(match node.stop() {
+                NodeEnd::GaveUp(reason) => gave_up(&project, &reason),
+                NodeEnd::Stopped => why,
+            }),
+        }
     }
 
     /// Returns whether the node is the command's own.
@@ -74,13 +83,29 @@ impl Target {
         NodeApi::connect(Path::new(path)).map_err(|why| SystemError::NotRegistered(path.clone(), why))
     }
 
-    /// Disconnects, and stops the own node.
-    pub(crate) fn close(self) {
+    /// Disconnects, and stops the own node. Returns the error if that had given up before.
+    pub(crate) fn close(self) -> Option<SystemError> {
         self.system.leave();
-        if let Some(node) = self.own {
-            node.stop();
+        match self.own?.stop() {
+            NodeEnd::GaveUp(reason) => Some(gave_up(&self.project, &reason)),
+            NodeEnd::Stopped => None,
         }
     }
+}
+
+/// Returns the error of an own node that gave up. A node learns some seconds after its start that another one has its
+/// address: all commands of a project give their nodes the same name and address.
+fn gave_up(project: &str, reason: &str) -> SystemError {
+    let reason = clean(reason);
+    if !reason.contains(&format!("'{NAME}'")) {
+        return SystemError::Bag(format!("the node for the recording has given up: {reason}"));
+    }
+    // The remedy behind it is that of a node with a configuration.
+    let place = reason.split(';').next().unwrap_or_default();
+    SystemError::Bag(format!(
+        "another `sinew play` runs in the project {project}: {place}; choose another project, as in --project \
+         {project}-2, or end the other command"
+    ))
 }
 
 /// Returns the path of the own node's socket, where other commands find it.
@@ -98,4 +123,22 @@ fn socket() -> Result<PathBuf, SystemError> {
         ))
     })?;
     Ok(folder.join(name))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn other_command_in_the_project_is_named_with_a_remedy() {
+        let reason = "node address 127.0.83.119 is used already by 'sinew-play' at 127.0.0.1:7; give this node another \
+                      `node.address`, or end the other one";
+        let error = gave_up("replay", reason).to_string();
+        let expected = "another `sinew play` runs in the project replay: node address 127.0.83.119 is used already by \
+                        'sinew-play' at 127.0.0.1:7; choose another project, as in --project replay-2, or end the \
+                        other command";
+        assert_eq!(error, expected);
+        let other = gave_up("replay", "layers: no interface").to_string();
+        assert!(other.contains("layers: no interface") && !other.contains("--project"), "{other}");
+    }
 }

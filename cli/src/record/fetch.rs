@@ -2,9 +2,11 @@
 
 mod convert;
 mod dead;
+#[cfg(test)]
+mod tests;
 
 use std::{
-    collections::BTreeSet,
+    collections::{BTreeMap, BTreeSet},
     fs::{self, OpenOptions},
     io::Write,
     ops::RangeInclusive,
@@ -67,10 +69,21 @@ struct Found {
     dead: Vec<DeadRing>,
     /// Nodes that have nothing to hand out, with the reason.
     refused: Vec<String>,
+    /// Nodes that were there, and did not answer when their spans were fetched.
+    silent: BTreeMap<NodeAddress, Silent>,
     /// Rings that are not gathered, with the remedy.
     skipped: BTreeSet<String>,
     /// Nodes that do not answer, and rings that cannot be read.
     faults: Vec<String>,
+}
+
+/// A node that does not answer any more.
+struct Silent {
+    name: String,
+    /// The reason, of the first span.
+    why: String,
+    /// The IDs of the spans that it has not handed out.
+    spans: Vec<String>,
 }
 
 /// Lists or gathers.
@@ -96,7 +109,22 @@ pub(super) fn show(system: &mut System, order: &Order) -> Result<Report, SystemE
     for id in ids {
         gather(system, &mut found, &id, (&out, order.force), &mut files);
     }
+    found.report_silent();
     Ok(gathered(&found, &files))
+}
+
+impl Found {
+    /// Adds one fault for each node that did not answer any more, with all spans that it has not handed out.
+    fn report_silent(&mut self) {
+        let line = |(node, Silent { name, why, spans }): (NodeAddress, Silent)| {
+            format!(
+                "{node} {name} has ended, or does not answer any more: {why}; not fetched: {}. Fetch again when it is \
+                 there",
+                spans.join(", ")
+            )
+        };
+        self.faults.extend(std::mem::take(&mut self.silent).into_iter().map(line));
+    }
 }
 
 /// Asks all nodes, and looks for rings of dead nodes on this host.
@@ -132,6 +160,7 @@ fn gather(
     files: &mut Vec<Converted>,
 ) {
     let own = system.endpoint.tid().node;
+    let first = files.len();
     let mut faults = Vec::new();
     let mut times = None;
     for Frozen { node, name, span } in found.frozen.iter().filter(|frozen| frozen.span.id == id) {
@@ -140,11 +169,18 @@ fn gather(
         }
         match fetch(system, *node, span, (out, is_forced), files) {
             Ok(file) => files.push(file),
+            Err(SystemError::NoAnswer(_, why)) => {
+                let silent = || Silent { name: name.clone(), why, spans: Vec::new() };
+                found.silent.entry(*node).or_insert_with(silent).spans.push(id.to_owned());
+            }
             Err(why) => faults.push(format!("{node} {name}: {why}")),
         }
     }
     let is_handed_out = found.frozen.iter().any(|frozen| frozen.span.id == id);
     for ring in &found.dead {
+        if has_ring(&files[first..], ring) {
+            continue;
+        }
         let part = match part_of(id, &ring.id, is_handed_out) {
             Part::None => continue,
             Part::Whole => Some(0..=u64::MAX),
@@ -250,6 +286,12 @@ fn part_of(id: &str, ring: &str, is_handed_out: bool) -> Part {
     if id == ring && !is_handed_out { Part::Whole } else { Part::None }
 }
 
+/// Returns whether one of the files of a span has the records of this ring: its node has started again, and has handed
+/// out what it froze before.
+fn has_ring(files: &[Converted], ring: &DeadRing) -> bool {
+    files.iter().any(|file| file.origin == (ring.address, Some(ring.incarnation)))
+}
+
 /// Writes the part of a dead node's ring that is within the span. `None` if it has no record of it.
 fn of_dead(
     ring: &DeadRing,
@@ -268,7 +310,15 @@ fn of_dead(
     // The node may have started again, and have the same span.
     let id = if id == ring.id { id.to_owned() } else { format!("{id}-{}", ring.id) };
     let (file, is_new) = path_of(files, out, (&ring.name, ring.address), &id);
-    convert(&source, None, file, is_forced && is_new).map(|file| Some(Converted { has_died: true, ..file }))
+    let written = convert(&source, None, file, is_forced && is_new)?;
+    if !ring.is_there() {
+        // Its records may be those of the next incarnation.
+        let _ = fs::remove_file(&written.file);
+        return Err(SystemError::Bag(
+            "its node has started again meanwhile; fetch the span again".to_owned(),
+        ));
+    }
+    Ok(Some(Converted { has_died: true, ..written }))
 }
 
 /// Returns the path of a file, and whether this run has not written it yet: then it may replace a former file. A second
@@ -335,7 +385,7 @@ fn ask(system: &mut System, node: NodeAddress, question: &AskFrozen) -> Result<F
     let until = Time::now() + BUSY_WITHIN;
     loop {
         let answer: Result<FrozenReport, _> = system.endpoint.message(to, question).ask(within);
-        let report = answer.map_err(|error| SystemError::Bag(in_words(&error)))?;
+        let report = answer.map_err(|error| SystemError::NoAnswer(node.to_string(), in_words(&error)))?;
         match report.refused {
             Some(why) if why == FROZEN_BUSY && Time::now() < until => std::thread::sleep(BUSY_PAUSE),
             Some(why) => return Err(SystemError::Bag(clean(&why))),
@@ -424,65 +474,4 @@ fn gathered(found: &Found, files: &[Converted]) -> Report {
 /// Returns a line for each node that has given nothing, and for each ring that was skipped.
 fn notes(found: &Found) -> String {
     found.refused.iter().chain(&found.skipped).chain(&found.faults).map(|line| clean(line) + "\n").collect()
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    fn written(file: &Path) -> Converted {
-        Converted {
-            file: file.to_owned(),
-            node: "knee".to_owned(),
-            written: 1,
-            dropped: 0,
-            first_ns: 5,
-            last_ns: 9,
-            times: 3..=10,
-            trigger: None,
-            has_died: false,
-        }
-    }
-
-    #[test]
-    fn no_file_of_one_run_replaces_another() {
-        let (out, first, second) = (Path::new("out"), NodeAddress::new(1), NodeAddress::new(2));
-        let (path, is_new) = path_of(&[], out, ("knee", first), "a-1");
-        assert!(is_new && path == Path::new("out/knee-a-1.mcap"), "{path:?}");
-        let files = [written(&path)];
-        let (other, is_new) = path_of(&files, out, ("knee", second), "a-1");
-        assert!(is_new && other == Path::new("out/knee-0.0.0.2-a-1.mcap"), "{other:?}");
-        let files = [written(&path), written(&other)];
-        assert!(!path_of(&files, out, ("knee", second), "a-1").1);
-    }
-
-    #[test]
-    fn ring_that_no_node_hands_out_is_gathered_whole() {
-        assert_eq!(part_of("died-1f", "died-1f", false), Part::Whole);
-        assert_eq!(part_of("died-1f", "died-1f", true), Part::None, "its node has started again");
-        assert_eq!(part_of("died-1f", "died-20", false), Part::None);
-        assert_eq!(part_of("10.0.0.2-1-1", "died-1f", true), Part::Span);
-    }
-
-    #[test]
-    fn replaced_span_is_another_one() {
-        let span = FrozenSpan { begin_ns: 3, end_ns: 9, ..FrozenSpan::default() };
-        let facts = |span: &FrozenSpan| FrozenFacts { span: Some(span.clone()), ..FrozenFacts::default() };
-        let fetched = FrozenSpan { is_fetched: true, ..span.clone() };
-        assert!(is_same(&facts(&span), &facts(&fetched)), "another command has fetched it");
-        for other in [FrozenSpan { begin_ns: 2, ..span.clone() }, FrozenSpan { end_ns: 10, ..span.clone() }] {
-            assert!(!is_same(&facts(&span), &facts(&other)), "{other:?}");
-        }
-    }
-
-    #[test]
-    fn missing_edges_of_a_span_are_stated() {
-        let found = Found::default();
-        let report = gathered(&found, &[written(Path::new("knee.mcap"))]);
-        assert!(report.text.contains("covers 0 us of 0 us"), "{}", report.text);
-        let file = &report.json["files"][0];
-        assert_eq!((file["covered_ns"].as_u64(), file["span_ns"].as_u64()), (Some(4), Some(7)));
-        let whole = Converted { times: 0..=u64::MAX, ..written(Path::new("knee.mcap")) };
-        assert_eq!(whole.json()["span_ns"].as_u64(), None);
-    }
 }

@@ -113,6 +113,37 @@ fn recording_is_summed_up_merged_and_exported() {
 }
 
 #[test]
+fn export_names_the_loss_of_a_damaged_file() {
+    let directory = TestDirectory::new();
+    let path = recorded(&directory, "hip", Direction::Sent, None);
+    let whole = fs::read(&path).expect("it was written");
+    // Given: a file without its end
+    fs::write(&path, &whole[..whole.len() - 20]).expect("the test's own directory");
+    let answer = bag(&directory, &["export", "hip.mcap", "--out", "cut"]);
+    assert_eq!(answer.code, Some(0), "as of a killed recorder: {}{}", answer.out, answer.err);
+    assert!(answer.out.contains("hip.mcap: unfinished: the file ends at byte"), "{}", answer.out);
+    let answer = bag(&directory, &["merge", "hip.mcap", "--out", "all.mcap"]);
+    assert!(answer.out.contains("unfinished: the file ends"), "{}{}", answer.out, answer.err);
+    // And: a file with a damaged chunk, the third one: the first ones have the descriptions of the channels
+    let (mut at, mut chunks) = (8, 0);
+    loop {
+        chunks += u32::from(whole[at] == 0x06);
+        if chunks == 3 {
+            break;
+        }
+        let length = u64::from_le_bytes(whole[at + 1..at + 9].try_into().expect("8 bytes"));
+        at += 9 + usize::try_from(length).expect("it is in the file");
+    }
+    let middle = at + 60;
+    let mut changed = whole.clone();
+    changed[middle] ^= 0x40;
+    fs::write(&path, changed).expect("the test's own directory");
+    let answer = bag(&directory, &["export", "hip.mcap", "--out", "changed"]);
+    assert_eq!(answer.code, Some(1), "{}{}", answer.out, answer.err);
+    assert!(answer.out.contains("a chunk is damaged"), "{}", answer.out);
+}
+
+#[test]
 fn file_that_is_no_recording_is_refused() {
     let directory = TestDirectory::new();
     fs::write(directory.join("notes.txt"), "no recording").expect("the test's own directory");

@@ -1,6 +1,7 @@
 //! `sinew play`: recorded messages are sent again, and a program is checked against its recording.
 
 use std::{
+    fs,
     path::{Path, PathBuf},
     process::Command,
 };
@@ -8,7 +9,7 @@ use std::{
 use rustix::process::Signal;
 use sinew::{AppAddress, NodeAddress, NodeApi, Registration, Tid, message::Kind};
 use sinew_bag::{BagWriter, ChannelInfo, Class, Direction, Options, Origin, Party, Record};
-use sinew_testkit::{NodeProcess, TestDirectory, program};
+use sinew_testkit::{NodeProcess, TestDirectory, program, until};
 
 use crate::scenario::{Answer, Scenario, named, node_command, sinew};
 
@@ -45,30 +46,35 @@ fn recorded(directory: &TestDirectory, numbers: &[u64]) -> PathBuf {
 
 /// Writes the recording of a hip that sends these counts to the knee, and these as protected commands.
 fn written(directory: &TestDirectory, numbers: &[u64], commands: &[u64]) -> PathBuf {
+    let ends = [(1, "hip"), (2, "knee")];
+    file_of(directory, &[(ends, false, numbers), (ends, true, commands)])
+}
+
+/// A channel: source and destination with their numbers, whether it is protected, and its counts.
+type Sent<'a> = ([(u32, &'a str); 2], bool, &'a [u64]);
+
+/// Writes the recording of the hip's node with these channels.
+fn file_of(directory: &TestDirectory, all: &[Sent<'_>]) -> PathBuf {
     let path = directory.join("walk.mcap");
     let origin =
         Origin { node: "hip".into(), address: "127.0.0.1".into(), incarnation: 1, ..Origin::default() };
     let mut bag = BagWriter::create(&path, Options::default(), origin).expect("the test's own directory");
-    let (hip, knee) = (party(1, "hip"), party(2, "knee"));
     let type_name = "scenario.count";
-    let mut channel = |is_protected| {
-        let info = ChannelInfo {
-            source: &hip,
-            destination: &knee,
+    for ([source, destination], is_protected, values) in all {
+        let channel = bag.channel(&ChannelInfo {
+            source: &party(source.0, source.1),
+            destination: &party(destination.0, destination.1),
             type_name,
             kind: Kind::named(type_name).bits(),
             class: Class::Bulk,
             direction: Direction::Sent,
-            is_protected,
+            is_protected: *is_protected,
             schema: None,
             refused: None,
             seen_before: 0,
-        };
-        bag.channel(&info).expect("there is room")
-    };
-    let channels = [channel(false), channel(true)];
-    for (channel, values) in channels.into_iter().zip([numbers, commands]) {
-        for (number, value) in (1..).zip(values) {
+        });
+        let channel = channel.expect("there is room");
+        for (number, value) in (1..).zip(*values) {
             let at_ns = FIRST_NS + (number - 1) * PERIOD_NS;
             let (sent_ns, handed_over_ns, payload) = (at_ns, at_ns, &count(*value)[..]);
             let record =
@@ -128,6 +134,54 @@ fn recorded_messages_arrive_as_from_the_recorded_name() {
     let counts = channels.iter().find(|one| one["channel"] == "/hip/scenario.count").expect("it was played");
     assert_eq!((&counts["sent"], &counts["rejected"], &counts["absent"]), (&3.into(), &0.into(), &0.into()));
     assert!(json["left_out"].as_object().is_some_and(serde_json::Map::is_empty), "its own project: {json}");
+}
+
+#[test]
+fn message_to_a_played_source_has_no_receiver() {
+    let scenario = Scenario::new();
+    let (hip, knee) = ((1, "hip"), (2, "knee"));
+    let file =
+        file_of(&scenario.directory, &[([hip, knee], false, &[1, 2, 3]), ([knee, hip], false, &[4, 5])]);
+    // When: both ends are sources, so the command has both names
+    let project = project();
+    let words = ["play", text(&file), "--project", &project, "--rate", "max", "--deadline-ms", "10000"];
+    let answer = sinew(&[&words[..], &["--json"]].concat(), &scenario.directory.join(""));
+    // Then
+    assert_eq!(answer.code, Some(0), "{}{}", answer.out, answer.err);
+    let json = answer.json();
+    assert_eq!((&json["sent"], &json["absent"]), (&0.into(), &5.into()), "{json}");
+    assert_eq!(json["played_itself"], serde_json::json!(["hip", "knee"]), "{json}");
+}
+
+#[test]
+fn second_command_in_one_project_names_the_first() {
+    let scenario = Scenario::new();
+    let file = recorded(&scenario.directory, &[1]);
+    let project = project();
+    let command = || {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_sinew"));
+        command.args(["play", text(&file), "--project", &project, "--wait", "60s"]);
+        command.env("XDG_RUNTIME_DIR", scenario.directory.join(""));
+        command
+    };
+    // Given: a command that waits for the knee. It has a socket when its node has one
+    let mut first = NodeProcess::start("sinew play", command());
+    until("the first command has its node", || {
+        fs::read_dir(scenario.directory.join("sinew")).ok()?.next().map(|_| ())
+    });
+    // When
+    let answer = Answer::of(&mut command());
+    // Then
+    assert_eq!(answer.code, Some(1), "{}{}", answer.out, answer.err);
+    for words in [
+        format!("another `sinew play` runs in the project {project}"),
+        "127.0.83.119".to_owned(),
+        format!("--project {project}-2"),
+    ] {
+        assert!(answer.err.contains(&words), "{words}: {}", answer.err);
+    }
+    first.signal(Signal::INT);
+    assert_eq!(first.wait_for_exit(), Some(0));
 }
 
 #[test]
@@ -199,7 +253,7 @@ fn first_message_that_differs_is_named() {
     let file = recorded(&scenario.directory, &[1, 2, 9, 9]);
     let answer = check(&scenario, &file, &[]);
     assert_eq!(answer.code, Some(1), "{}{}", answer.out, answer.err);
-    let expected = "the first difference: message 3 of hip, scenario.count to knee at 1.040000 s: `number` was 9 and is 3\n";
+    let expected = "the first difference: message 3 of hip, scenario.count to knee at 1.040000000s: `number` was 9 and is 3\n";
     assert_eq!(answer.out, expected, "{}", answer.err);
     let json = check(&scenario, &file, &["--json"]).json();
     assert_eq!((&json["result"], &json["number"]), (&"differs".into(), &3.into()), "{json}");
@@ -211,6 +265,26 @@ fn first_message_that_differs_is_named() {
         "{}",
         answer.err
     );
+}
+
+#[test]
+fn check_of_a_file_that_is_cut_off_is_no_proof() {
+    let scenario = Scenario::new();
+    let file = recorded(&scenario.directory, &[1, 2, 3]);
+    let bytes = fs::read(&file).expect("it was written");
+    fs::write(&file, &bytes[..bytes.len() - 20]).expect("the test's own directory");
+    let answer = check(&scenario, &file, &[]);
+    assert_eq!(answer.code, Some(1), "{}{}", answer.out, answer.err);
+    for words in ["not whole: 3 messages", "unfinished: the file ends at byte"] {
+        assert!(answer.out.contains(words), "{words}: {}", answer.out);
+    }
+    // And: an end before the missing one is proved
+    let mut command = Command::new(env!("CARGO_BIN_EXE_sinew"));
+    let program = node_command();
+    command.args(["play", "--check"]).arg(&file).args(["--start-before", "20ms", "--to", "25ms", "--"]);
+    command.arg(program.get_program()).args(program.get_args()).arg(scenario.configure("hip", 1, &[]));
+    let answer = Answer::of(command.args(["--sends-to", "knee"]));
+    assert!(answer.code == Some(0) && answer.out.starts_with("identical"), "{}{}", answer.out, answer.err);
 }
 
 #[test]

@@ -116,7 +116,10 @@ fn request_to_stop_finishes_the_file() {
 #[test]
 fn killed_node_leaves_a_finished_file() {
     let scenario = Scenario::new();
-    let mut knee = scenario.start("knee", 2, &[]);
+    // In the folder of the test, which is removed: the ring of a killed node stays.
+    let folder = scenario.directory.join("");
+    let record = format!("[record]\nfolder = \"{}\"\nkeep_bytes = 16_777_216\n[ndl]", folder.display());
+    let mut knee = scenario.start_changed("knee", 2, &[("[ndl]", &record)], &[]);
     let file = scenario.directory.join("walk.mcap");
     let mut recorder = with_traffic(&scenario, &mut knee, || start(&scenario, &file));
     assert!(knee.kill());

@@ -62,6 +62,8 @@ pub(crate) struct Flight {
     is_refusing: AtomicBool,
     /// Whether spans are kept at all.
     keeps_spans: bool,
+    /// Whether the journal, and the names beside it, outlive an orderly end of the node.
+    keeps_journal: bool,
 }
 
 /// Causes that were reported by any thread of the process.
@@ -183,6 +185,7 @@ impl Flight {
             folder,
             is_refusing: AtomicBool::new(false),
             keeps_spans: config.frozen_max > 0,
+            keeps_journal: config.folder.is_some(),
         })
     }
 
@@ -334,6 +337,20 @@ impl Flight {
             }
             Err(_) => {}
         }
+        // The end of the node may have removed them before they were written.
+        // SYNC: SeqCst, as in `remove_names`: either this thread sees the end, or the end sees the file.
+        if self.is_ending.load(Ordering::SeqCst) {
+            self.remove_names(journal.path());
+        }
+    }
+
+    /// Removes the names beside a journal that ends with the node. It waits for no thread that is writing them: that
+    /// thread removes them, too.
+    pub(super) fn remove_names(&self, journal: &Path) {
+        if !self.keeps_journal {
+            // There is none, or it stays because the folder refuses that.
+            let _ = std::fs::remove_file(journal.with_extension("facts"));
+        }
     }
 
     /// Carries out the orders of the thread `freeze`.
@@ -398,7 +415,8 @@ impl Flight {
     /// Has all spans frozen that are not complete yet, up to this moment: the node ends. [`wait`](Self::wait) waits for
     /// the copies.
     pub(super) fn finish(self: &Arc<Self>, node: &NodeState, journal: &Journal) {
-        self.is_ending.store(true, Ordering::Relaxed);
+        // SYNC: SeqCst, the partner is `write_names`: names that are written from now on are removed by their writer.
+        self.is_ending.store(true, Ordering::SeqCst);
         // The failure of an actor may be why the node ends.
         self.take_causes(Time::now(), &[]);
         if !self.keeps_spans {

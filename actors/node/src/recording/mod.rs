@@ -110,6 +110,9 @@ impl Ending {
             && !self.is_kept
         {
             active.journal.remove();
+            if let Some(flight) = &self.flight {
+                flight.remove_names(active.journal.path());
+            }
         }
     }
 }

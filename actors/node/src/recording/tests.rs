@@ -227,8 +227,20 @@ fn journal_of_a_configured_file_ends_with_the_node() {
     node.recording.begin_configured(&node).expect("it begins");
     let path = node.recording.path().expect("it records, for the program that writes the file");
     assert!(path.starts_with(MEMORY) || path.starts_with(std::env::temp_dir()), "{path:?}");
+    let facts = path.with_extension("facts");
+    let deadline = Time::now() + WATCHDOG;
+    while !facts.exists() {
+        assert!(Time::now() < deadline, "waited for the names beside the journal");
+        std::thread::yield_now();
+    }
+    // And: a thread that has begun a turn before the end of the node
+    let (flight, journal) = (node.recording.flight().expect("it has one").clone(), lock_journal(&node));
     node.recording.close(&node);
-    assert!(!path.exists());
+    assert!(!path.exists() && !facts.exists());
+    let changes = facts::Changes { has_new_names: true, ..facts::Changes::default() };
+    app(&node, "knee");
+    flight.turn(&node, &journal, Time::now(), &changes);
+    assert!(!facts.exists(), "it removes the names that it has written");
 }
 
 #[test]

@@ -25,6 +25,8 @@ pub(super) struct Source<'a> {
 pub(super) struct Converted {
     pub(super) file: PathBuf,
     pub(super) node: String,
+    /// The address of the node, and its incarnation if the facts have it.
+    pub(super) origin: (NodeAddress, Option<u64>),
     pub(super) written: u64,
     pub(super) dropped: u64,
     /// The times of its first and its last record, in nanoseconds of the monotonic clock of the node's host.
@@ -83,6 +85,7 @@ pub(super) fn convert(
     Ok(Converted {
         file,
         node: report.name.clone(),
+        origin: (*address, report.incarnation.map(|incarnation| incarnation.0)),
         written: written.totals.written,
         dropped: written.totals.dropped,
         first_ns: written.first_ns,

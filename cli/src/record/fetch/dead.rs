@@ -22,6 +22,7 @@ pub(super) struct DeadRing {
     pub(super) name: String,
     pub(super) address: NodeAddress,
     pub(super) facts: FrozenFacts,
+    pub(super) incarnation: u64,
     /// The ID of the whole ring. The node hands it out by this ID after its next start.
     pub(super) id: String,
     /// Whether its times are of the clock that counts now.
@@ -29,6 +30,12 @@ pub(super) struct DeadRing {
 }
 
 impl DeadRing {
+    /// Returns whether the file is still that of this incarnation: the next one gives it another name.
+    pub(super) fn is_there(&self) -> bool {
+        let origin = RingOrigin::read(&self.path, Owners::AllForRoot);
+        origin.is_some_and(|origin| origin.incarnation == self.incarnation)
+    }
+
     /// Returns why it was not gathered with a span, and the remedy.
     pub(super) fn remedy(&self) -> String {
         let why = if self.is_of_this_boot {
@@ -73,7 +80,16 @@ pub(super) fn rings(folders: BTreeSet<&Path>, project: &str) -> Vec<DeadRing> {
         .filter(|path| is_ring(path) && is_own(path, Owners::AllForRoot))
         .collect();
     paths.sort();
-    paths.into_iter().filter_map(|path| ring(path, project)).take(RINGS_MAX).collect()
+    let rings = paths.into_iter().filter_map(|path| ring(path, project)).take(RINGS_MAX);
+    without_copies(rings.collect())
+}
+
+/// Leaves out the second file of one ring: a node that starts again renames it, or copies it to another folder, at the
+/// same time.
+fn without_copies(mut rings: Vec<DeadRing>) -> Vec<DeadRing> {
+    let mut known = BTreeSet::new();
+    rings.retain(|ring| known.insert((ring.address, ring.incarnation)));
+    rings
 }
 
 fn is_ring(path: &Path) -> bool {
@@ -87,8 +103,8 @@ fn ring(path: PathBuf, project: &str) -> Option<DeadRing> {
     let (now, present_offset) = clocks();
     let is_of_this_boot = is_of_this_boot(origin.created_ns, origin.wall_offset_ns, now, present_offset);
     let id = origin.id();
-    let RingOrigin { node: name, address, facts, .. } = origin;
-    Some(DeadRing { path, name, address, facts, id, is_of_this_boot })
+    let RingOrigin { node: name, address, facts, incarnation, .. } = origin;
+    Some(DeadRing { path, name, address, facts, incarnation, id, is_of_this_boot })
 }
 
 #[cfg(test)]
@@ -106,16 +122,29 @@ mod tests {
         assert!(!is_of_this_boot(400 * SECOND, i64::MIN, now, i64::MAX));
     }
 
-    #[test]
-    fn skipped_ring_has_a_remedy() {
-        let ring = DeadRing {
-            path: "/dev/shm/sinew-leg-10.0.0.2.journal".into(),
+    fn ring(path: &str, incarnation: u64) -> DeadRing {
+        DeadRing {
+            path: path.into(),
             name: "knee".to_owned(),
             address: NodeAddress::new(0x0a00_0002),
             facts: FrozenFacts::default(),
-            id: "died-1f".to_owned(),
+            incarnation,
+            id: format!("died-{incarnation:x}"),
             is_of_this_boot: true,
-        };
+        }
+    }
+
+    #[test]
+    fn ring_with_two_names_counts_once() {
+        let (journal, kept) = ("sinew-leg-10.0.0.2.journal", "sinew-leg-10.0.0.2-died-1f.frozen");
+        let rings = without_copies(vec![ring(kept, 0x1f), ring(journal, 0x1f), ring(journal, 0x20)]);
+        let found: Vec<_> = rings.iter().map(|ring| ring.incarnation).collect();
+        assert_eq!(found, [0x1f, 0x20]);
+    }
+
+    #[test]
+    fn skipped_ring_has_a_remedy() {
+        let ring = ring("/dev/shm/sinew-leg-10.0.0.2.journal", 0x1f);
         assert!(ring.remedy().contains("`sinew record fetch died-1f`"), "{}", ring.remedy());
     }
 }

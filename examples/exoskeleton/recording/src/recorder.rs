@@ -124,7 +124,7 @@ impl WalkRecorder {
         match sinew_bag::merge(&recorded.files, &path) {
             Ok(merged) => {
                 recorded.bound_ns = merged.nodes.iter().map(|node| node.bound_ns).max().unwrap_or(0);
-                recorded.faults.extend(merged.damage);
+                recorded.faults.extend(merged.damage.into_iter().chain(merged.unfinished));
                 recorded.merged = Some(path);
             }
             Err(error) => recorded.faults.push(format!("the files are not merged: {error}")),

@@ -41,7 +41,7 @@ const WAITING_MAX: usize = 65_536;
 pub struct Replayed {
     /// The results of each joint.
     pub joints: PerJoint<JointResult>,
-    /// Damage of the file, which was skipped.
+    /// Damage of the file, which was skipped, and the end that it lacks.
     pub damage: Vec<String>,
 }
 
@@ -135,7 +135,9 @@ pub fn replay(path: &Path, gain_factor: f64) -> Result<Replayed, ReplayError> {
     run(&mut waiting, &inputs, &|_| true);
     let began_ns = drives.iter().filter_map(DriveReplay::began_ns).min();
     let Some(began_ns) = began_ns else { return Err(ReplayError::NoTicks(path.to_owned())) };
-    Ok(Replayed { joints: drives.map(|drive| drive.result(began_ns)), damage: file.damage().to_vec() })
+    let damage = file.damage().iter().map(String::as_str).chain(file.missing_end());
+    let damage = damage.map(str::to_owned).collect();
+    Ok(Replayed { joints: drives.map(|drive| drive.result(began_ns)), damage })
 }
 
 impl Replayed {
@@ -155,9 +157,12 @@ impl Replayed {
         }
     }
 
-    /// Whether the recorded ticks were computed again, each with the same result.
+    /// Whether the recorded ticks were computed again, each with the same result, and the file is whole.
     #[must_use]
     pub fn is_same(&self) -> bool {
+        if !self.damage.is_empty() {
+            return false;
+        }
         let is_whole = |joint: &JointResult| joint.identical == joint.compared && joint.gap.is_none();
         self.joints.iter().all(is_whole) && self.joints.iter().any(|joint| joint.compared > 0)
     }
@@ -216,6 +221,12 @@ impl fmt::Display for Replayed {
         if self.joints.iter().any(|joint| joint.first_difference.is_some()) {
             return writeln!(f, "DIFFERENT: see the first difference above");
         }
+        if !self.damage.is_empty() {
+            return writeln!(
+                f,
+                "INCOMPLETE: no compared torque differs; the file is damaged or cut off, see above"
+            );
+        }
         writeln!(f, "INCOMPLETE: no compared torque differs; the recording lacks inputs of the others")
     }
 }
@@ -229,6 +240,18 @@ mod tests {
             |compared| JointResult { ticks: 10, compared, identical: compared, ..JointResult::default() };
         let joints = [JointResult { gap, ..joint(7) }, joint(10), joint(8)];
         Replayed { joints, damage: Vec::new() }.to_string()
+    }
+
+    #[test]
+    fn file_with_damage_is_never_the_same() {
+        let joint = JointResult { ticks: 10, compared: 10, identical: 10, ..JointResult::default() };
+        let joints = [joint.clone(), joint.clone(), joint];
+        let whole = Replayed { joints, damage: Vec::new() };
+        assert!(whole.is_same() && whole.to_string().contains("SAME"), "{whole}");
+        let cut = Replayed { damage: vec!["walk.mcap: unfinished".to_owned()], ..whole };
+        let words = cut.to_string();
+        assert!(!cut.is_same() && words.contains("walk.mcap: unfinished"), "{words}");
+        assert!(words.contains("INCOMPLETE") && !words.contains("SAME"), "{words}");
     }
 
     #[test]

@@ -119,6 +119,17 @@ fn recorded_walk_gives_the_same_torques() {
 }
 
 #[test]
+fn walk_that_is_cut_off_is_not_the_same() {
+    let file = TestFile::new("cut");
+    write(&file.0, walk());
+    let bytes = std::fs::read(&file.0).expect("it was written");
+    std::fs::write(&file.0, &bytes[..bytes.len() * 9 / 10]).expect("there is room on the disk");
+    let replayed = replay(&file.0, 1.0).expect("it has ticks");
+    assert!(!replayed.is_same() && replayed.joints.iter().all(|joint| joint.compared > 0), "{replayed}");
+    assert!(replayed.damage[0].contains("unfinished: the file ends at byte "), "{replayed}");
+}
+
+#[test]
 fn one_changed_gain_is_named_at_its_first_tick() {
     let all: Vec<_> = walk().iter().collect();
     let replayed = replayed("gain", &all, 1.001);
