@@ -226,28 +226,40 @@ fn none_received(
 /// overlap in time, each that has both earlier and later messages must have dropped the number.
 fn excused(end: &End, given: &Given, numbers: impl Iterator<Item = u64>) -> u64 {
     let groups = given.get(&end.own).map(Recordings::groups).unwrap_or_default();
-    let mut left: BTreeMap<usize, Vec<((u64, u64), u64)>> = BTreeMap::new();
+    let mut left: BTreeMap<usize, Vec<DropBudget>> = BTreeMap::new();
     for (incarnation, spans) in &end.incarnations {
         for (began_ns, span) in spans {
             let recording = (*incarnation, *began_ns);
             // One without a tally has counted nothing.
             let Some(group) = groups.get(&recording) else { continue };
             let dropped = end.dropped.get(&recording).copied().unwrap_or(0);
-            left.entry(*group).or_default().push((*span, dropped));
+            left.entry(*group).or_default().push(DropBudget { span: *span, left: dropped });
         }
     }
     numbers.filter(|number| left.values_mut().any(|group| excuse(group, *number))).count() as u64
 }
 
+/// The counted drops of a recording that no missing message has used yet.
+struct DropBudget {
+    /// The first and the last number in the recording.
+    span: (u64, u64),
+    left: u64,
+}
+
+impl DropBudget {
+    fn covers(&self, number: u64) -> bool {
+        (self.span.0..=self.span.1).contains(&number)
+    }
+}
+
 /// Takes the number from the counters of dropped messages of all recordings of a group that it lies within. Returns
 /// `false` if there is none, or if one has no dropped message left.
-fn excuse(group: &mut [((u64, u64), u64)], number: u64) -> bool {
-    let has = |((first, last), _): &((u64, u64), u64)| (*first..=*last).contains(&number);
-    let mut within = group.iter().filter(|one| has(one)).peekable();
-    if within.peek().is_none() || within.any(|(_, left)| *left == 0) {
+fn excuse(group: &mut [DropBudget], number: u64) -> bool {
+    let mut within = group.iter().filter(|recording| recording.covers(number)).peekable();
+    if within.peek().is_none() || within.any(|recording| recording.left == 0) {
         return false;
     }
-    group.iter_mut().filter(|one| has(one)).for_each(|(_, left)| *left -= 1);
+    group.iter_mut().filter(|recording| recording.covers(number)).for_each(|recording| recording.left -= 1);
     true
 }
 
