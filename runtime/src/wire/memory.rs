@@ -28,12 +28,12 @@ const IN_TURN: usize = 8;
 /// Number of payloads for which the next buffer in turn is checked before the first few, after a payload that
 /// found these used. A session keeps each payload until it is acknowledged, so they are used nearly always.
 const CROWDED: u8 = 16;
-/// Initial bytes of an allocation for one payload.
+/// Least initial bytes of an allocation for one payload.
 const SHORT: usize = 128;
 
 thread_local! {
     static BUFFERS: RefCell<Buffers> = const {
-        RefCell::new(Buffers { all: Vec::new(), next: FIRST, crowded: 0, last_copied: 0 })
+        RefCell::new(Buffers { all: Vec::new(), next: FIRST, crowded: 0, last_copied: 0, alone: [SHORT; 2] })
     };
 }
 
@@ -107,8 +107,19 @@ struct Buffer {
 }
 
 impl Buffer {
+    /// Returns a buffer of the thread, or memory of its own if none is free.
     fn take() -> Self {
-        Self::of_thread().unwrap_or_else(|| Self { memory: BytesMut::with_capacity(SHORT), place: None })
+        let taken = BUFFERS.try_with(|buffers| {
+            let mut buffers = buffers.borrow_mut();
+            buffers.take().ok_or_else(|| buffers.expected_length())
+        });
+        // A thread at its end may have destroyed this variable.
+        let length = match taken {
+            Ok(Ok(buffer)) => return buffer,
+            Ok(Err(length)) => length,
+            Err(_) => SHORT,
+        };
+        Self { memory: BytesMut::with_capacity(length), place: None }
     }
 
     /// Returns a buffer of the thread, if one is free.
@@ -127,7 +138,13 @@ impl Buffer {
 
     /// Splits off the written bytes. They keep the buffer from being reused while they exist.
     fn cut(&mut self) -> BytesMut {
-        if self.place.is_some() { self.memory.split() } else { std::mem::take(&mut self.memory) }
+        if self.place.is_some() {
+            return self.memory.split();
+        }
+        let memory = std::mem::take(&mut self.memory);
+        // A thread at its end may have destroyed this variable.
+        let _ = BUFFERS.try_with(|buffers| buffers.borrow_mut().note_alone(memory.len()));
+        memory
     }
 }
 
@@ -151,9 +168,22 @@ struct Buffers {
     crowded: u8,
     /// The buffer of the last copied payload.
     last_copied: usize,
+    /// The lengths in bytes of the last two payloads with memory of their own.
+    alone: [usize; 2],
 }
 
 impl Buffers {
+    /// Returns the initial bytes of memory for one payload. In a burst of payloads of one length, this is their
+    /// length, so that the memory does not have to grow. Of two lengths it is the smaller one: a short payload
+    /// never keeps memory for long ones.
+    fn expected_length(&self) -> usize {
+        self.alone[0].min(self.alone[1]).clamp(SHORT, BUFFER_BYTES)
+    }
+
+    fn note_alone(&mut self, length: usize) {
+        self.alone = [length, self.alone[0]];
+    }
+
     /// Takes a buffer, while code of the payload's type writes to it.
     fn take(&mut self) -> Option<Buffer> {
         let place = self.place()?;
@@ -332,6 +362,25 @@ mod tests {
             all.iter().all(|payload| places.contains(&payload.as_ptr())),
             "memory was allocated while a buffer was free"
         );
+    }
+
+    #[test]
+    fn payloads_beyond_the_buffers_get_the_memory_they_need() {
+        let _used: Vec<_> = (0..BUFFERS_MAX).map(|_| payload(1, 1000)).collect();
+        let capacity = || {
+            let writer = Writer(Buffer::take());
+            assert!(writer.0.place.is_none());
+            writer.0.memory.capacity()
+        };
+        assert_eq!(capacity(), SHORT);
+        let _first = payload(1, 1000);
+        assert_eq!(capacity(), SHORT, "a single long one");
+        let _second = payload(1, 900);
+        assert_eq!(capacity(), 900);
+        let _short = payload(1, 10);
+        assert_eq!(capacity(), SHORT);
+        let _long = [payload(1, 100_000), payload(1, 100_000)];
+        assert_eq!(capacity(), BUFFER_BYTES);
     }
 
     #[test]
