@@ -307,7 +307,7 @@ pub struct Totals {
     pub dropped: u64,
     /// Messages with a payload that does not fit its schema. They are written without a view.
     pub misfits: u64,
-    /// Events and clock readings that are in no file.
+    /// Events, outcomes and clock readings that are in no file.
     pub events_lost: u64,
     /// Bytes of all parts.
     pub bytes: u64,

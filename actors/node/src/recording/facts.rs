@@ -7,13 +7,12 @@ use std::{
 };
 
 use sinew_model::facts::LossReason;
-use sinew_record::{Channel, ClockFact, Fact, Form, LogFact, NodeFact, PeerClock, fact};
+use sinew_record::{Channel, ClockFact, Fact, LogFact, NodeFact, PeerClock, fact};
 use sinew_runtime::{
     lock,
     log::{LogObserver, tracing::Level},
-    tid::{AppAddress, Incarnation, NodeAddress, Tid},
+    tid::{Incarnation, NodeAddress, Tid},
     time::Time,
-    wire::{Class, Kind},
 };
 use sinew_shm::journal::Journal;
 
@@ -33,15 +32,9 @@ pub(super) struct KnownFacts {
     clocks_due: Time,
 }
 
-/// Returns the key of all facts of a form.
-fn key(node: NodeAddress, form: Form) -> sinew_shm::journal::ChannelKey {
-    let (source, kind) = (Tid::new(node, AppAddress::NONE), Kind::from_bits(0));
-    Channel { source, destination: Tid::NONE, kind, class: Class::Control, form, refused: None }.key()
-}
-
 /// Writes a fact.
 pub(super) fn write<F: Fact>(journal: &Journal, node: NodeAddress, now: Time, of: &F) {
-    journal.write(key(node, F::FORM), now.as_nanos(), &[&fact(of)]);
+    journal.write(Channel::of_node(node, F::FORM).key(), now.as_nanos(), &[&fact(of)]);
 }
 
 /// Writes each event of the process's log.

@@ -26,9 +26,10 @@ use std::{
 
 use rustix::time::{ClockId, clock_gettime};
 use sinew_model::context::NodeContext;
-use sinew_record::{NodeFact, RecordTap, Selection};
+use sinew_record::{NodeFact, OutcomeTap, RecordTap, Selection};
 use sinew_runtime::{
     log::{self, LogObserver},
+    outcome::{self, OutcomeObserver},
     router::tap::{Tap, TapOf},
     tid::Tid,
     time::Time,
@@ -82,6 +83,8 @@ struct Active {
     selection: Selection,
     /// The names and addresses of the tap.
     chosen: Option<sinew_record::Chosen>,
+    /// Writes outcomes, as long as it is here.
+    outcomes: Option<Arc<dyn OutcomeObserver>>,
     /// Writes the log, as long as it is here.
     _log: Arc<dyn LogObserver>,
 }
@@ -222,8 +225,9 @@ impl Recording {
             state.programs.clear();
             (state.active.take(), state.configured.take().is_some())
         };
-        let Some(active) = active else { return Ending::default() };
+        let Some(mut active) = active else { return Ending::default() };
         install(node, None);
+        active.outcomes = None;
         let flight = self.flight().cloned();
         if let Some(flight) = &flight {
             flight.finish(node, &active.journal);
@@ -265,7 +269,8 @@ impl Recording {
                 Arc::new(LogWriter { node: node.ctx.node, journal: journal.clone() });
             // More nodes of one process than have room record without the log.
             log::observe(&log);
-            state.active = Some(Active { journal, selection: Selection::default(), chosen: None, _log: log });
+            let selection = Selection::default();
+            state.active = Some(Active { journal, selection, chosen: None, outcomes: None, _log: log });
         }
         self.settle(node, names, state);
         Ok(())
@@ -354,6 +359,11 @@ impl Active {
         if self.chosen.as_ref() != Some(&chosen) {
             let tap = RecordTap::new(node.ctx.node, self.journal.clone(), chosen.clone());
             install(node, Some(Arc::new(tap)));
+            let outcomes = OutcomeTap::new(node.ctx.node, self.journal.clone(), chosen.clone());
+            let outcomes: Arc<dyn OutcomeObserver> = Arc::new(outcomes);
+            // More nodes of one process than have room record without outcomes.
+            outcome::observe(&outcomes, self.outcomes.as_ref());
+            self.outcomes = Some(outcomes);
             self.chosen = Some(chosen);
         }
     }

@@ -7,6 +7,7 @@ use sinew_model::config::NodeConfig;
 use sinew_record::{Channel, ClockFact, Entry, Fact as _, Form};
 use sinew_runtime::{
     incident::{self, IncidentKind},
+    outcome::{Outcome, Ticket},
     router::{LocalRoute, MessageSink, SubmitError},
     tid::{AppAddress, Incarnation},
     wire::{Header, Message, Payload},
@@ -68,7 +69,7 @@ fn read(path: &Path) -> (Vec<Vec<u8>>, Vec<Form>) {
         let form = Channel::of(channel.key.expect("its key")).expect("a channel").form;
         match Entry::read(&bytes).expect("a record") {
             Entry::Message(message) => messages.push(message.payload.expect("it is there").to_vec()),
-            Entry::Node(_) | Entry::Clock(_) | Entry::Log(_) => facts.push(form),
+            Entry::Node(_) | Entry::Clock(_) | Entry::Log(_) | Entry::Outcome(_) => facts.push(form),
         }
     }
     (messages, facts)
@@ -96,6 +97,22 @@ fn program_has_its_messages_recorded_until_it_leaves() {
         assert!(Time::now() < deadline, "waited for the end of the thread");
         std::thread::yield_now();
     }
+}
+
+#[test]
+fn outcomes_are_recorded_from_the_begin_on() {
+    let node = node("outcomes", |_| {});
+    let hip = app(&node, "hip");
+    let show = || {
+        let ticket = Ticket { source: hip, destination: hip, correlation: 77 };
+        outcome::show(ticket, Outcome::Delivered);
+    };
+    show();
+    let path = node.recording.ask(&node, hip, Selection::default(), Time::now()).expect("it begins");
+    show();
+    let (_, facts) = read(&path);
+    assert_eq!(facts.iter().filter(|form| **form == Form::Outcome).count(), 1);
+    node.recording.leave(&node, hip);
 }
 
 // spec: INSPECT-9
