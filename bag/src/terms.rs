@@ -223,6 +223,8 @@ pub struct ClockReading {
     pub bound_ns: u64,
     /// How fast the other clock gains on this one, in parts per billion.
     pub drift_ppb: i64,
+    /// How wrong `drift_ppb` may be, in parts per billion. 200,000 with a drift of 0: the drift is unknown.
+    pub drift_bound_ppb: u64,
 }
 
 /// The topic of an event.

@@ -218,6 +218,8 @@ mod tests {
             incarnation: sinew_runtime::tid::Incarnation(4),
             theirs_minus_ours_ns: -5,
             bound_ns: 80_000,
+            drift_ppb: -1_500,
+            drift_bound_ppb: 200,
         };
         let clock = ClockFact { wall_offset_ns: 1 << 60, peers: vec![peer] };
         assert_eq!(Entry::read(&fact(&clock)).unwrap(), Entry::Clock(clock));

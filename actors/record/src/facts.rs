@@ -61,6 +61,12 @@ pub struct PeerClock {
     pub theirs_minus_ours_ns: i64,
     /// The largest error of this, in nanoseconds.
     pub bound_ns: u64,
+    /// How fast its clock gains on this node's, in parts per billion.
+    #[serde(default)]
+    pub drift_ppb: i64,
+    /// The largest error of that. 200,000 with a drift of 0: the drift is unknown.
+    #[serde(default)]
+    pub drift_bound_ppb: u64,
 }
 
 /// A line of the node's log.

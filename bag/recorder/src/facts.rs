@@ -75,8 +75,8 @@ pub(crate) fn clocks(sink: &mut Sink, at_ns: u64, peers: &[PeerClock], names: &N
             incarnation: peer.incarnation.0,
             offset_ns: peer.theirs_minus_ours_ns,
             bound_ns: peer.bound_ns,
-            // The node does not report it: two readings give it.
-            drift_ppb: 0,
+            drift_ppb: peer.drift_ppb,
+            drift_bound_ppb: peer.drift_bound_ppb,
         };
         sink.clock(at_ns, &reading);
     }

@@ -8,8 +8,8 @@ use std::{
 
 use sinew_bag::{BagWriter, Options, Origin, Totals};
 use sinew_record::{
-    Channel, Entry, Fact, Form, LogFact, MessageEntry, NodeFact, OutcomeEntry, Selection, fact, lost_channel,
-    message_head,
+    Channel, ClockFact, Entry, Fact, Form, LogFact, MessageEntry, NodeFact, OutcomeEntry, PeerClock,
+    Selection, fact, lost_channel, message_head,
 };
 use sinew_runtime::{
     outcome::{Outcome, Rejection, Ticket},
@@ -249,7 +249,21 @@ fn facts_are_events_and_log_lines() {
     write_fact(&bench.journal, &NodeFact::Barrier { name: "go".to_owned(), generation: 1, waiting, missing });
     let line = LogFact { level: "warn".to_owned(), target: "test".to_owned(), text: "slow".to_owned() };
     write_fact(&bench.journal, &line);
-    assert!(bench.recorder.pump(SECOND).unwrap());
+    let peer = PeerClock {
+        node,
+        incarnation,
+        theirs_minus_ours_ns: -7,
+        bound_ns: 80,
+        drift_ppb: -1_500,
+        drift_bound_ppb: 200,
+    };
+    write_fact(&bench.journal, &ClockFact { wall_offset_ns: 0, peers: vec![peer] });
+    bench.read(SECOND);
+    bench.recorder.pump(3 * SECOND).unwrap();
+    let clocks = read_file(&bench.folder.join("leg.mcap"), "/sinew/clock");
+    let clock: serde_json::Value = serde_json::from_slice(&clocks[0].1).unwrap();
+    let drift = serde_json::json!([clock["offset_ns"], clock["drift_ppb"], clock["drift_bound_ppb"]]);
+    assert_eq!(drift, serde_json::json!([-7, -1_500, 200]));
     let (_, topics) = bench.finish();
     for topic in ["/sinew/events", "/sinew/barriers", "/sinew/log"] {
         assert!(topics.iter().any(|found| found == topic), "{topic}: {topics:?}");

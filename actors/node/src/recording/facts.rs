@@ -176,6 +176,8 @@ pub(crate) fn clocks(state: &NodeState, now: Time) -> Vec<PeerClock> {
             incarnation: member.incarnation,
             theirs_minus_ours_ns: offset.theirs_minus_ours_ns,
             bound_ns: u64::try_from(offset.bound.as_nanos()).unwrap_or(u64::MAX),
+            drift_ppb: offset.drift.ppb,
+            drift_bound_ppb: offset.drift.bound_ppb,
         })
     };
     present.into_iter().filter_map(clock).collect()
