@@ -225,6 +225,15 @@ mod tests {
         assert_eq!(Entry::read(&fact(&clock)).unwrap(), Entry::Clock(clock));
         let log = LogFact { level: "warn".into(), target: "sinew::gncl".into(), text: "slow".into() };
         assert_eq!(Entry::read(&fact(&log)).unwrap(), Entry::Log(log));
+        let restarted = NodeFact::Restarted {
+            node: NodeAddress::new(9),
+            app: None,
+            name: "gncl".into(),
+            supervisor: "layers".into(),
+            restarts: 3,
+            why: "panicked".into(),
+        };
+        assert_eq!(Entry::read(&fact(&restarted)).unwrap(), Entry::Node(restarted));
         let named = NodeFact::TypeNamed { kind: 7, name: "test.any".into() };
         assert_eq!(Entry::read(&fact(&named)).unwrap(), Entry::Node(named));
     }

@@ -32,6 +32,10 @@ pub(crate) fn node(sink: &mut Sink, at_ns: u64, fact: &NodeFact) {
         NodeFact::AppGone { node, app, name } => {
             (name, format!("the application {name} at {} has ended", Tid::new(*node, *app)))
         }
+        NodeFact::Restarted { name, restarts, why, .. } => {
+            level = Level::Warning;
+            (name, format!("the actor {name} is restarted (restart {restarts}); its last end: {why}"))
+        }
         NodeFact::Barrier { name, generation, waiting, missing } => {
             topic = EventTopic::Barriers;
             let list = |names: &[String]| if names.is_empty() { "none".to_owned() } else { names.join(", ") };
@@ -61,6 +65,7 @@ pub(crate) fn learn(names: &mut Names, fact: &NodeFact) {
         // Messages of it may still be in the journal.
         NodeFact::NodeLost { .. }
         | NodeFact::AppGone { .. }
+        | NodeFact::Restarted { .. }
         | NodeFact::Barrier { .. }
         | NodeFact::Triggered { .. } => {}
     }

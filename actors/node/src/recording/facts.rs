@@ -6,11 +6,12 @@ use std::{
     time::Duration,
 };
 
-use sinew_model::facts::LossReason;
+use sinew_model::{facts::LossReason, leave_reason::LeaveReason};
 use sinew_record::{Channel, ClockFact, Fact, LogFact, NodeFact, PeerClock, fact};
 use sinew_runtime::{
     lock,
     log::{LogObserver, tracing::Level},
+    supervision::{ActorRestart, RestartObserver},
     tid::{Incarnation, NodeAddress, Tid},
     time::Time,
 };
@@ -37,13 +38,32 @@ pub(super) fn write<F: Fact>(journal: &Journal, node: NodeAddress, now: Time, of
     journal.write(Channel::of_node(node, F::FORM).key(), now.as_nanos(), &[&fact(of)]);
 }
 
-/// Writes each event of the process's log.
-pub(super) struct LogWriter {
+/// Writes each event of the process's log, and each restart.
+pub(super) struct FactWriter {
     pub(super) node: NodeAddress,
     pub(super) journal: Arc<Journal>,
 }
 
-impl LogObserver for LogWriter {
+impl RestartObserver for FactWriter {
+    fn restarted(&self, restart: &ActorRestart<'_>) {
+        let ActorRestart { name, supervisor, tid, restarts, why } = *restart;
+        // Other nodes of this process have writers of their own. Layers have no address: each node has their restarts.
+        if tid.is_some_and(|tid| tid.node != self.node) {
+            return;
+        }
+        let fact = NodeFact::Restarted {
+            node: self.node,
+            app: tid.map(|tid| tid.app),
+            name: name.to_owned(),
+            supervisor: supervisor.to_owned(),
+            restarts,
+            why: LeaveReason::of(why).as_str().to_owned(),
+        };
+        write(&self.journal, self.node, Time::now(), &fact);
+    }
+}
+
+impl LogObserver for FactWriter {
     fn wrote(&self, level: Level, target: &str, text: &str) {
         let line = LogFact {
             level: level.as_str().to_ascii_lowercase(),

@@ -31,13 +31,14 @@ use sinew_runtime::{
     log::{self, LogObserver},
     outcome::{self, OutcomeObserver},
     router::tap::{Tap, TapOf},
+    supervision::{RestartObserver, observe_restarts},
     tid::Tid,
     time::Time,
     wire::{Kind, known_types},
 };
 use sinew_shm::journal::{CreateJournalError, Journal, Options};
 
-use facts::{KnownFacts, LogWriter};
+use facts::{FactWriter, KnownFacts};
 pub(crate) use flight::Flight;
 pub(crate) use names::{journal_kinds, report};
 pub(crate) use triggers::Triggers;
@@ -85,8 +86,8 @@ struct Active {
     chosen: Option<sinew_record::Chosen>,
     /// Writes outcomes, as long as it is here.
     outcomes: Option<Arc<dyn OutcomeObserver>>,
-    /// Writes the log, as long as it is here.
-    _log: Arc<dyn LogObserver>,
+    /// Writes the log and restarts, as long as it is here.
+    _facts: Arc<FactWriter>,
 }
 
 /// A recording that has ended. Its journal may still be copied.
@@ -265,12 +266,14 @@ impl Recording {
                 journal.remove();
                 return Err(why.into());
             }
-            let log: Arc<dyn LogObserver> =
-                Arc::new(LogWriter { node: node.ctx.node, journal: journal.clone() });
-            // More nodes of one process than have room record without the log.
+            let facts = Arc::new(FactWriter { node: node.ctx.node, journal: journal.clone() });
+            let (log, restarts): (Arc<dyn LogObserver>, Arc<dyn RestartObserver>) =
+                (facts.clone(), facts.clone());
+            // More nodes of one process than have room record without the log and without restarts.
             log::observe(&log);
+            observe_restarts(&restarts);
             let selection = Selection::default();
-            state.active = Some(Active { journal, selection, chosen: None, outcomes: None, _log: log });
+            state.active = Some(Active { journal, selection, chosen: None, outcomes: None, _facts: facts });
         }
         self.settle(node, names, state);
         Ok(())

@@ -9,6 +9,7 @@ use sinew_runtime::{
     incident::{self, IncidentKind},
     outcome::{Outcome, Ticket},
     router::{LocalRoute, MessageSink, SubmitError},
+    supervision::ActorRestart,
     tid::{AppAddress, Incarnation},
     wire::{Header, Message, Payload},
 };
@@ -99,19 +100,56 @@ fn program_has_its_messages_recorded_until_it_leaves() {
     }
 }
 
+/// Calls a function with each record in the journal. Facts and outcomes of other tests of this process are there, too.
+fn each_entry(path: &Path, mut each: impl FnMut(Entry<'_>)) {
+    let mut reader = JournalReader::open(path, Start::Oldest).expect("it is there");
+    let mut bytes = Vec::new();
+    while reader.next(0, &mut bytes).expect("it is whole").is_some() {
+        each(Entry::read(&bytes).expect("a record"));
+    }
+}
+
+#[test]
+fn restart_of_an_own_actor_is_a_fact() {
+    const NAME: &str = "a hip that restarts";
+    let node = node("restarts", |_| {});
+    let hip = app(&node, "hip");
+    let path = node.recording.ask(&node, hip, Selection::default(), Time::now()).expect("it begins");
+    let writer = FactWriter { node: node.ctx.node, journal: lock_journal(&node) };
+    let elsewhere = Tid::new(sinew_runtime::tid::NodeAddress::new(9), hip.app);
+    for (tid, restarts) in [(Some(hip), 3), (Some(elsewhere), 1), (None, 2)] {
+        let (name, supervisor, why) = (NAME, "applications", "panicked\nat night");
+        writer.restarted(&ActorRestart { name, supervisor, tid, restarts, why });
+    }
+    let mut found = Vec::new();
+    each_entry(&path, |entry| match entry {
+        Entry::Node(NodeFact::Restarted { app, restarts, why, name, .. }) if name == NAME => {
+            assert_eq!(why, "panicked at night");
+            found.push((app, restarts));
+        }
+        Entry::Message(_) | Entry::Node(_) | Entry::Clock(_) | Entry::Log(_) | Entry::Outcome(_) => {}
+    });
+    assert_eq!(found, [(Some(hip.app), 3), (None, 2)]);
+    node.recording.leave(&node, hip);
+}
+
 #[test]
 fn outcomes_are_recorded_from_the_begin_on() {
+    const NUMBER: u64 = 0x7707_7077;
     let node = node("outcomes", |_| {});
     let hip = app(&node, "hip");
-    let show = || {
-        let ticket = Ticket { source: hip, destination: hip, correlation: 77 };
-        outcome::show(ticket, Outcome::Delivered);
+    let show = |outcome| {
+        outcome::show(Ticket { source: hip, destination: hip, correlation: NUMBER }, outcome);
     };
-    show();
+    show(Outcome::Failed);
     let path = node.recording.ask(&node, hip, Selection::default(), Time::now()).expect("it begins");
-    show();
-    let (_, facts) = read(&path);
-    assert_eq!(facts.iter().filter(|form| **form == Form::Outcome).count(), 1);
+    show(Outcome::Delivered);
+    let mut found = Vec::new();
+    each_entry(&path, |entry| match entry {
+        Entry::Outcome(entry) if entry.ticket.correlation == NUMBER => found.push(entry.outcome),
+        Entry::Message(_) | Entry::Node(_) | Entry::Clock(_) | Entry::Log(_) | Entry::Outcome(_) => {}
+    });
+    assert_eq!(found, [Outcome::Delivered]);
     node.recording.leave(&node, hip);
 }
 
