@@ -438,9 +438,9 @@ impl Flight {
         let freeze = || -> Result<u64, FrozenError> {
             let draft = self.store().draft(&id, &replaces)?;
             // Without the lock: the copy takes as long as the disk does, and questions need the lock.
-            let drafted = draft.copy(journal, &span)?;
-            self.store().keep(&drafted, &facts, &replaces)?;
-            Ok(drafted.records)
+            let records = draft.copy(journal, &span)?;
+            self.store().keep(&facts, &replaces)?;
+            Ok(records)
         };
         match freeze() {
             Ok(records) => log::warn!(id, cause, records, "the messages around a fault are frozen"),
