@@ -237,6 +237,13 @@ impl FrozenStore {
         Ok(())
     }
 
+    /// Returns the number of spans if there is no room for one more.
+    pub(crate) fn is_full(&self) -> Option<usize> {
+        let spans = self.spans();
+        let is_full = spans.len() >= self.spans_max && !spans.iter().any(|span| span.is_fetched);
+        is_full.then_some(spans.len())
+    }
+
     /// Removes a span.
     pub(crate) fn discard(&self, id: &str) {
         for extension in ["facts", "frozen"] {

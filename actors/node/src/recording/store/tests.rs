@@ -125,9 +125,11 @@ fn oldest_spans_stay_until_they_are_fetched() {
     let (mut store, journal) = (folder.store(2), folder.journal());
     assert_eq!(freeze(&mut store, &journal, &span("a-1", 2)).unwrap(), 3);
     assert_eq!(freeze(&mut store, &journal, &span("a-2", 4)).unwrap(), 3);
+    assert_eq!(store.is_full(), Some(2));
     let full = freeze(&mut store, &journal, &span("a-3", 6)).unwrap_err();
     assert!(full.to_string().contains("sinew record fetch"), "{full}");
     store.set_fetched("a-1").unwrap();
+    assert_eq!(store.is_full(), None);
     freeze(&mut store, &journal, &span("a-3", 6)).unwrap();
     let ids: Vec<_> = store.spans().into_iter().map(|span| (span.id, span.is_fetched)).collect();
     assert_eq!(ids, [("a-2".to_owned(), false), ("a-3".to_owned(), false)]);
