@@ -252,6 +252,7 @@ impl Recording {
     fn start(&self, node: &Arc<NodeState>, names: &KnownNames, state: &mut State) -> Result<(), RecordError> {
         if state.active.is_none() {
             let now = Time::now();
+            names::remember_own_types();
             let journal = Arc::new(create(node, now)?);
             let began = NodeFact::Began {
                 node: node.ctx.node,

@@ -198,6 +198,11 @@ fn type_only_sent_has_its_name_and_structure() {
     assert_eq!(types[0].kind, Torque::KIND, "those of the question stand first");
     let structure = Torque::KIND.schema().expect("it is known").expect("it has a structure");
     assert_eq!(types[0].schema, Some(structure.schema().encode()));
+    // And: types that no application of this node has sent have names, if they are of Sinew
+    let names = KnownNames::of(&node).kinds;
+    for name in ["sinew.echo", "sinew.ping", "sinew.param.set", "sinew.barrier.arrive"] {
+        assert_eq!(names.get(&Kind::named(name)).map(String::as_str), Some(name));
+    }
     // And: its name can be selected.
     assert_eq!(KnownNames::of(&node).kinds.get(&Torque::KIND).map(String::as_str), Some(Torque::NAME));
     node.recording.close(&node);
