@@ -223,6 +223,8 @@ pub struct ClockReading {
     pub bound_ns: u64,
     /// How fast the other clock gains on this one, in parts per billion.
     pub drift_ppb: i64,
+    /// How wrong `drift_ppb` may be, in parts per billion. 200,000 with a drift of 0: the drift is unknown.
+    pub drift_bound_ppb: u64,
 }
 
 /// The topic of an event.
@@ -307,7 +309,7 @@ pub struct Totals {
     pub dropped: u64,
     /// Messages with a payload that does not fit its schema. They are written without a view.
     pub misfits: u64,
-    /// Events and clock readings that are in no file.
+    /// Events, outcomes and clock readings that are in no file.
     pub events_lost: u64,
     /// Bytes of all parts.
     pub bytes: u64,

@@ -270,6 +270,11 @@ impl BagWriter {
         self.record(records::of_topic(event.topic), event.at_ns, &text)
     }
 
+    /// Counts events, clock readings or outcomes that the recorder did not get.
+    pub const fn lose_events(&mut self, count: u64) {
+        self.events_lost = self.events_lost.saturating_add(count);
+    }
+
     fn record(&mut self, of: &records::Fixed, now_ns: u64, text: &str) -> Result<(), BagError> {
         self.resume(now_ns);
         let Some(part) = &mut self.part else {

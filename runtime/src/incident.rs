@@ -1,17 +1,9 @@
 //! Incidents of this process: a guard that was shut, a missed deadline, a failed actor. Nodes that record observe them,
 //! and freeze the messages around them.
 
-use std::{
-    fmt,
-    sync::{Arc, Mutex, Weak},
-};
+use std::{fmt, sync::Arc};
 
-use arc_swap::ArcSwapOption;
-
-use crate::{lock, time::Time};
-
-/// Maximum number of observers in a process: each node of it that records is one.
-const OBSERVERS_MAX: usize = 64;
+use crate::{observers::Observers, time::Time};
 
 /// The kind of an incident.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -29,41 +21,29 @@ pub trait IncidentObserver: Send + Sync {
     fn happened(&self, at: Time, kind: IncidentKind, cause: &str);
 }
 
-/// The observers, some of which may have been dropped. A thread that reports an incident reads the list without a lock.
-static OBSERVERS: ArcSwapOption<Vec<Weak<dyn IncidentObserver>>> = ArcSwapOption::const_empty();
-/// Held while the list is replaced.
-static CHANGE: Mutex<()> = Mutex::new(());
+static OBSERVERS: Observers<dyn IncidentObserver> = Observers::new();
 
 /// Adds an observer, for as long as it lives. Returns `false` if there are too many.
 pub fn observe(observer: &Arc<dyn IncidentObserver>) -> bool {
-    let _change = lock(&CHANGE);
-    let before = OBSERVERS.load();
-    let living = before.iter().flat_map(|observers| observers.iter());
-    let mut observers: Vec<_> = living.filter(|other| other.strong_count() > 0).cloned().collect();
-    let has_room = observers.len() < OBSERVERS_MAX;
-    if has_room {
-        observers.push(Arc::downgrade(observer));
-    }
-    OBSERVERS.store(Some(Arc::new(observers)));
-    has_room
+    OBSERVERS.add(observer, None)
 }
 
 /// Reports an incident to all observers. It never waits, also where other threads report incidents or add observers at
 /// this moment: an observer that is just being added may miss it. It may be called from a panic hook.
 pub fn report(at: Time, kind: IncidentKind, cause: fmt::Arguments<'_>) {
-    // Without any observer an incident costs one load.
-    let Some(observers) = OBSERVERS.load_full() else { return };
-    let mut living = observers.iter().filter_map(Weak::upgrade).peekable();
-    if living.peek().is_none() {
-        return;
-    }
-    let cause = cause.to_string();
-    living.for_each(|observer| observer.happened(at, kind, &cause));
+    let mut text = None;
+    OBSERVERS.each(|observer| {
+        let cause = text.get_or_insert_with(|| cause.to_string());
+        observer.happened(at, kind, cause);
+    });
 }
 
 #[cfg(test)]
 mod tests {
+    use std::sync::Mutex;
+
     use super::*;
+    use crate::lock;
 
     /// Held by each test: an observer that a test drops is not in use by another one.
     static ALONE: Mutex<()> = Mutex::new(());
@@ -102,7 +82,7 @@ mod tests {
         let observer: Arc<dyn IncidentObserver> = notes.clone();
         assert!(observe(&observer));
         // Given: another observer is being added
-        let change = lock(&CHANGE);
+        let change = OBSERVERS.while_changed();
         // When
         report(Time::from_nanos(8), IncidentKind::Failure, format_args!("test of incidents"));
         // Then

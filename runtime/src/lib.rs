@@ -42,6 +42,7 @@ pub mod log;
 pub mod mailbox;
 pub mod monitor;
 pub mod name;
+mod observers;
 pub mod outcome;
 pub mod pending;
 pub mod protection;

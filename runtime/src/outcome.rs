@@ -5,12 +5,16 @@
 //! and the sender is notified without further code.
 
 mod members;
+mod observer;
 
 use std::{fmt, sync::Arc};
 
 use serde::{Deserialize, Serialize};
 
-pub use self::members::{MEMBERS_MAX, MemberOutcome, MemberReport, MemberState, MemberTable, REPORTS_MAX};
+pub use self::{
+    members::{MEMBERS_MAX, MemberOutcome, MemberReport, MemberState, MemberTable, REPORTS_MAX},
+    observer::{OutcomeObserver, observe, show, show_members},
+};
 use crate::tid::{AppAddress, NodeAddress, Tid};
 
 /// The outcome of a confirmed message.

@@ -13,7 +13,7 @@ use std::{
 use crate::{
     clock::Clock,
     lock,
-    outcome::{MemberOutcome, MemberReport, MemberTable, Outcome, ReceiptSink, Ticket},
+    outcome::{self, MemberOutcome, MemberReport, MemberTable, Outcome, ReceiptSink, Ticket},
     router::{MessageSink, SubmitError},
     tid::{NodeAddress, Tid},
     time::Time,
@@ -212,10 +212,12 @@ impl Pending {
 
 impl ReceiptSink for Pending {
     fn settle(&self, ticket: Ticket, outcome: Outcome) {
+        outcome::show(ticket, outcome);
         self.settle_with(ticket.correlation, ticket.destination, Settlement::Outcome(outcome));
     }
 
     fn members(&self, ticket: Ticket, reports: &[MemberReport]) {
+        outcome::show_members(ticket, reports);
         let mut inner = lock(&self.inner);
         if let Some(slot) = inner.slots.get_mut(&ticket.correlation)
             && slot.from == ticket.destination

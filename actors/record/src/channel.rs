@@ -8,7 +8,7 @@
 
 use sinew_runtime::{
     outcome::{Outcome, Rejection},
-    tid::Tid,
+    tid::{AppAddress, NodeAddress, Tid},
     wire::{Class, Kind},
 };
 use sinew_shm::journal::ChannelKey;
@@ -27,11 +27,14 @@ pub enum Form {
     Clock,
     /// A [`LogFact`](crate::facts::LogFact).
     Log,
+    /// An [`OutcomeEntry`](crate::outcome::OutcomeEntry).
+    Outcome,
 }
 
 impl Form {
     /// All forms.
-    pub const ALL: [Self; 5] = [Self::Sent, Self::Received, Self::Node, Self::Clock, Self::Log];
+    pub const ALL: [Self; 6] =
+        [Self::Sent, Self::Received, Self::Node, Self::Clock, Self::Log, Self::Outcome];
 
     /// Returns the number in a record.
     #[must_use]
@@ -52,7 +55,7 @@ impl Form {
     }
 }
 
-/// A channel: messages of one type from one application to another, or facts of one form.
+/// A channel: messages of one type from one application to another, or facts or outcomes of one node.
 ///
 /// # Examples
 ///
@@ -74,7 +77,7 @@ impl Form {
 /// ```
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Channel {
-    /// The sender; for a fact the node's own address without an application.
+    /// The sender; for a fact or an outcome the node's own address without an application.
     pub source: Tid,
     /// The destination; of received messages to a group, the member.
     pub destination: Tid,
@@ -89,6 +92,13 @@ pub struct Channel {
 }
 
 impl Channel {
+    /// Returns the channel of all facts of a form, or of all outcomes, of a node.
+    #[must_use]
+    pub const fn of_node(node: NodeAddress, form: Form) -> Self {
+        let (source, kind) = (Tid::new(node, AppAddress::NONE), Kind::from_bits(0));
+        Self { source, destination: Tid::NONE, kind, class: Class::Control, form, refused: None }
+    }
+
     /// Returns the key in the table.
     #[must_use]
     pub fn key(&self) -> ChannelKey {
@@ -184,6 +194,6 @@ mod tests {
             }
         }
         assert_eq!(keys.len(), count);
-        assert!(count > 5 * 3 * 10);
+        assert!(count > 6 * 3 * 10);
     }
 }

@@ -7,6 +7,7 @@
 //!      3  zero, five bytes
 //!      8  a message: its header in 64 bytes, as in a frame that stays in memory; then its payload
 //!         a fact: MessagePack
+//!         an outcome: 32 bytes, see [`OutcomeEntry`]
 //! ```
 //!
 //! The payload of a message may be missing, if its reporter had no room for it. Its header has its length all the same.
@@ -20,12 +21,13 @@ use thiserror::Error;
 use crate::{
     channel::{Form, refused_code, refused_of},
     facts::{ClockFact, Fact, LogFact, NodeFact},
+    outcome::OutcomeEntry,
 };
 
 /// The version of the records that this code writes.
 pub const VERSION: u8 = 1;
 /// Bytes before a fact, and before the header of a message.
-const HEAD: usize = 8;
+pub(crate) const HEAD: usize = 8;
 /// Bytes before the payload of a message.
 pub const MESSAGE_HEAD: usize = HEAD + HEADER_LEN;
 
@@ -62,6 +64,8 @@ pub enum Entry<'a> {
     Clock(ClockFact),
     /// A line of the log.
     Log(LogFact),
+    /// The outcome of a confirmed message.
+    Outcome(OutcomeEntry),
 }
 
 /// A message.
@@ -102,6 +106,9 @@ pub enum EntryError {
         /// Bytes of the header.
         stated: usize,
     },
+    /// The outcome has another length, or bytes without a meaning.
+    #[error("a recorded outcome cannot be read")]
+    Outcome,
     /// The fact cannot be decoded.
     #[error("a recorded fact cannot be read: {0}")]
     Fact(String),
@@ -137,10 +144,13 @@ impl<'a> Entry<'a> {
         let refused = refused_of(refused).ok_or(EntryError::Form)?;
         match form {
             Form::Sent | Form::Received => MessageEntry::read(form, refused, rest).map(Self::Message),
-            Form::Node | Form::Clock | Form::Log if refused.is_some() => Err(EntryError::Form),
+            Form::Node | Form::Clock | Form::Log | Form::Outcome if refused.is_some() => {
+                Err(EntryError::Form)
+            }
             Form::Node => read_fact(rest).map(Self::Node),
             Form::Clock => read_fact(rest).map(Self::Clock),
             Form::Log => read_fact(rest).map(Self::Log),
+            Form::Outcome => OutcomeEntry::read(rest).map(Self::Outcome).ok_or(EntryError::Outcome),
         }
     }
 }
@@ -208,11 +218,22 @@ mod tests {
             incarnation: sinew_runtime::tid::Incarnation(4),
             theirs_minus_ours_ns: -5,
             bound_ns: 80_000,
+            drift_ppb: -1_500,
+            drift_bound_ppb: 200,
         };
         let clock = ClockFact { wall_offset_ns: 1 << 60, peers: vec![peer] };
         assert_eq!(Entry::read(&fact(&clock)).unwrap(), Entry::Clock(clock));
         let log = LogFact { level: "warn".into(), target: "sinew::gncl".into(), text: "slow".into() };
         assert_eq!(Entry::read(&fact(&log)).unwrap(), Entry::Log(log));
+        let restarted = NodeFact::Restarted {
+            node: NodeAddress::new(9),
+            app: None,
+            name: "gncl".into(),
+            supervisor: "layers".into(),
+            restarts: 3,
+            why: "panicked".into(),
+        };
+        assert_eq!(Entry::read(&fact(&restarted)).unwrap(), Entry::Node(restarted));
         let named = NodeFact::TypeNamed { kind: 7, name: "test.any".into() };
         assert_eq!(Entry::read(&fact(&named)).unwrap(), Entry::Node(named));
     }

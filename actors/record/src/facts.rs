@@ -25,6 +25,16 @@ pub enum NodeFact {
     AppNamed { node: NodeAddress, app: AppAddress, name: String, is_ready: bool },
     /// An application has the name no more.
     AppGone { node: NodeAddress, app: AppAddress, name: String },
+    /// An actor of this node's process was restarted; `why` is how its last incarnation ended. `app` is the address of
+    /// an application; layers and supervisors have none.
+    Restarted {
+        node: NodeAddress,
+        app: Option<AppAddress>,
+        name: String,
+        supervisor: String,
+        restarts: u64,
+        why: String,
+    },
     /// The state of a barrier has changed: its open generation, the waiting applications and the missing ones.
     Barrier { name: String, generation: u64, waiting: Vec<String>, missing: Vec<String> },
     /// The name of a payload type.
@@ -61,6 +71,12 @@ pub struct PeerClock {
     pub theirs_minus_ours_ns: i64,
     /// The largest error of this, in nanoseconds.
     pub bound_ns: u64,
+    /// How fast its clock gains on this node's, in parts per billion.
+    #[serde(default)]
+    pub drift_ppb: i64,
+    /// The largest error of that. 200,000 with a drift of 0: the drift is unknown.
+    #[serde(default)]
+    pub drift_bound_ppb: u64,
 }
 
 /// A line of the node's log.

@@ -127,7 +127,7 @@ impl Payload for FrozenReport {
 pub struct FrozenSpan {
     /// The ID of its trigger, the same on all nodes; of a node that has died, an ID of its own.
     pub id: String,
-    /// The cause.
+    /// The causes that the node knew, in the order of their times, and the number of those beyond eight.
     pub cause: String,
     /// The time of the trigger; 0 for a node that has died.
     pub at_ns: u64,

@@ -8,8 +8,9 @@
 //! | [`facts`] | events of nodes and applications, clock offsets, log lines |
 //! | [`files`] | reads files in a folder that other users may write into |
 //! | [`frozen`] | the questions that freeze a span of the recordings and that fetch one, and their answers |
+//! | [`outcome`] | the outcome of a confirmed message |
 //! | [`question`] | the question that has a node record, and its answer |
-//! | [`tap`] | writes the selected messages of a routing table |
+//! | [`tap`] | writes the selected messages of a routing table, and their outcomes |
 //! | [`selection`] | applications, payload types and groups, by names and patterns |
 
 pub mod channel;
@@ -17,6 +18,7 @@ pub mod entry;
 pub mod facts;
 pub mod files;
 pub mod frozen;
+pub mod outcome;
 pub mod question;
 pub mod selection;
 pub mod tap;
@@ -28,8 +30,9 @@ pub use frozen::{
     AskFreeze, AskFrozen, FROZEN_BUSY, FROZEN_BYTES_MAX, FROZEN_SPANS_MAX, FreezeReport, FrozenFacts,
     FrozenPart, FrozenReport, FrozenSpan,
 };
+pub use outcome::OutcomeEntry;
 pub use question::{
     AskRecord, CLOCKS_MAX, RECORDED_MAX, RecordReport, RecordedApp, RecordedType, SCHEMAS_MAX,
 };
 pub use selection::{Chosen, Selection, SelectionError};
-pub use tap::{RecordTap, lost_channel};
+pub use tap::{OutcomeTap, RecordTap, lost_channel};

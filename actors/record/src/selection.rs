@@ -171,7 +171,13 @@ impl Chosen {
     #[must_use]
     pub fn has(&self, source: Tid, destination: Tid, kind: Kind) -> bool {
         let is_kind = self.kinds.as_ref().is_none_or(|kinds| kinds.binary_search(&kind).is_ok());
-        is_kind && (self.has_app(source) || self.has_app(destination) || self.has_group(destination))
+        is_kind && self.has_ends(source, destination)
+    }
+
+    /// Returns whether messages of some type between these ends are chosen.
+    #[must_use]
+    pub fn has_ends(&self, source: Tid, destination: Tid) -> bool {
+        self.has_app(source) || self.has_app(destination) || self.has_group(destination)
     }
 
     /// Returns whether the groups of this selection have an influence: then messages of applications that are not

@@ -1,8 +1,10 @@
-//! Writes each selected message into the journal, on its sender's thread: no lock, no allocation, no wait.
+//! Writes each selected message into the journal, on its sender's thread, and each outcome, on the thread that settles
+//! the message: no lock, no allocation, no wait.
 
 use std::sync::Arc;
 
 use sinew_runtime::{
+    outcome::{Outcome, OutcomeObserver, Ticket},
     router::tap::{Passage, Tap, Way},
     tid::{AppAddress, NodeAddress, Tid},
     time::Time,
@@ -10,7 +12,7 @@ use sinew_runtime::{
 };
 use sinew_shm::journal::Journal;
 
-use crate::{Channel, Chosen, Form, message_head};
+use crate::{Channel, Chosen, Form, OutcomeEntry, message_head};
 
 /// The entry of the routing table while the node records.
 pub struct RecordTap {
@@ -56,8 +58,7 @@ impl Tap for RecordTap {
     fn saw(&self, app: Tid, passage: &Passage<'_>) {
         let Passage { header, payload, length, refused, .. } = *passage;
         let (source, destination) = (header.source, header.destination);
-        // A program that reads a recording must not fill the ring with its own questions.
-        if [source, destination].iter().any(|party| party.app == AppAddress::INSPECT) {
+        if is_inspection(source, destination) {
             return;
         }
         if !self.chosen.has(source, destination, header.kind) && !self.chosen.has(app, app, header.kind) {
@@ -74,6 +75,43 @@ impl Tap for RecordTap {
 
     fn missed(&self, app: Tid, messages: u64) {
         self.journal.count(lost_channel(app).key(), messages);
+    }
+}
+
+/// Returns whether it is a question to the inspection of a node, or its answer. A program that reads a recording must
+/// not fill the ring with its own questions.
+fn is_inspection(source: Tid, destination: Tid) -> bool {
+    [source, destination].iter().any(|party| party.app == AppAddress::INSPECT)
+}
+
+/// The observer of outcomes while the node records: those of confirmed messages that applications of this node sent.
+///
+/// The types of their messages are not known here, so a selection of types does not limit them.
+pub struct OutcomeTap {
+    node: NodeAddress,
+    journal: Arc<Journal>,
+    chosen: Chosen,
+}
+
+impl OutcomeTap {
+    /// Creates the observer of the node at this address.
+    #[must_use]
+    pub const fn new(node: NodeAddress, journal: Arc<Journal>, chosen: Chosen) -> Self {
+        Self { node, journal, chosen }
+    }
+}
+
+impl OutcomeObserver for OutcomeTap {
+    fn settled(&self, ticket: Ticket, outcome: Outcome) {
+        let Ticket { source, destination, .. } = ticket;
+        // Other nodes of this process have observers of their own.
+        let is_own = source.node == self.node;
+        if !is_own || is_inspection(source, destination) || !self.chosen.has_ends(source, destination) {
+            return;
+        }
+        let (key, record) =
+            (Channel::of_node(self.node, Form::Outcome).key(), OutcomeEntry { ticket, outcome });
+        self.journal.write(key, Time::now().as_nanos(), &[&record.record()]);
     }
 }
 
@@ -217,6 +255,34 @@ mod tests {
         bench.show(tid(0x1002), Way::Out, &header(tid(0x1002), tid(0x1003)), None);
         let expected = [(Form::Received, tid(0x1002), None), (Form::Sent, tid(0x1003), None)];
         assert_eq!(bench.records(), expected);
+    }
+
+    #[test]
+    fn outcomes_of_own_messages_are_recorded() {
+        let selection = Selection { apps: vec!["knee".to_owned()], ..Selection::default() };
+        let bench = Bench::new("outcomes", &selection, &[("knee", tid(0x1002))]);
+        let RecordTap { node, journal, chosen } = &bench.tap;
+        let tap = OutcomeTap::new(*node, journal.clone(), chosen.clone());
+        let elsewhere = Tid::new(NodeAddress::new(9), AppAddress::new(0x1002));
+        let show = |source, destination| {
+            tap.settled(Ticket { source, destination, correlation: 7 }, Outcome::PeerLost);
+        };
+        show(tid(0x1001), tid(0x1002));
+        show(tid(0x1001), tid(0x1003));
+        show(elsewhere, tid(0x1002));
+        show(tid(0x1002), Tid::new(NODE, AppAddress::INSPECT));
+        show(tid(0x1002), elsewhere);
+        let mut reader = JournalReader::open(&bench.path, Start::Oldest).expect("it is there");
+        let (mut bytes, mut found) = (Vec::new(), Vec::new());
+        while reader.next(0, &mut bytes).expect("it is whole").is_some() {
+            let Ok(Entry::Outcome(entry)) = Entry::read(&bytes) else { panic!("no outcome") };
+            assert_eq!((entry.ticket.correlation, entry.outcome), (7, Outcome::PeerLost));
+            found.push((entry.ticket.source, entry.ticket.destination));
+        }
+        assert_eq!(found, [(tid(0x1001), tid(0x1002)), (tid(0x1002), elsewhere)]);
+        let channels = reader.channels().expect("it is there");
+        let seen: Vec<_> = channels.iter().map(|channel| (channel.key, channel.seen)).collect();
+        assert_eq!(seen, [(Some(Channel::of_node(NODE, Form::Outcome).key()), 2)]);
     }
 
     #[test]

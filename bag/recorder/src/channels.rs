@@ -204,7 +204,8 @@ impl Description {
     }
 }
 
-fn party(tid: Tid, names: &Names) -> Party {
+/// Describes one end of a message.
+pub(crate) fn party(tid: Tid, names: &Names) -> Party {
     // A group has its name on all nodes.
     let named = if tid.app.is_group() { Tid::new(NodeAddress::ALL, tid.app) } else { tid };
     let is_one = tid.is_single() && tid.node.is_single();

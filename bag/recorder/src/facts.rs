@@ -1,11 +1,15 @@
-//! Facts of a journal as events of a recording.
+//! Facts and outcomes of a journal as events of a recording.
 
-use serde_json::Value;
+use serde_json::{Value, json};
 use sinew_bag::{ClockReading, Event, EventTopic, Level};
-use sinew_record::{LogFact, NodeFact, PeerClock};
-use sinew_runtime::{tid::Tid, wire::Kind};
+use sinew_record::{LogFact, NodeFact, OutcomeEntry, PeerClock};
+use sinew_runtime::{
+    outcome::{Outcome, Ticket},
+    tid::Tid,
+    wire::Kind,
+};
 
-use crate::{names::Names, sink::Sink};
+use crate::{channels::party, names::Names, sink::Sink};
 
 /// Writes a change of nodes, applications or barriers.
 pub(crate) fn node(sink: &mut Sink, at_ns: u64, fact: &NodeFact) {
@@ -27,6 +31,10 @@ pub(crate) fn node(sink: &mut Sink, at_ns: u64, fact: &NodeFact) {
         }
         NodeFact::AppGone { node, app, name } => {
             (name, format!("the application {name} at {} has ended", Tid::new(*node, *app)))
+        }
+        NodeFact::Restarted { name, restarts, why, .. } => {
+            level = Level::Warning;
+            (name, format!("the actor {name} is restarted (restart {restarts}); its last end: {why}"))
         }
         NodeFact::Barrier { name, generation, waiting, missing } => {
             topic = EventTopic::Barriers;
@@ -57,6 +65,7 @@ pub(crate) fn learn(names: &mut Names, fact: &NodeFact) {
         // Messages of it may still be in the journal.
         NodeFact::NodeLost { .. }
         | NodeFact::AppGone { .. }
+        | NodeFact::Restarted { .. }
         | NodeFact::Barrier { .. }
         | NodeFact::Triggered { .. } => {}
     }
@@ -71,8 +80,8 @@ pub(crate) fn clocks(sink: &mut Sink, at_ns: u64, peers: &[PeerClock], names: &N
             incarnation: peer.incarnation.0,
             offset_ns: peer.theirs_minus_ours_ns,
             bound_ns: peer.bound_ns,
-            // The node does not report it: two readings give it.
-            drift_ppb: 0,
+            drift_ppb: peer.drift_ppb,
+            drift_bound_ppb: peer.drift_bound_ppb,
         };
         sink.clock(at_ns, &reading);
     }
@@ -97,11 +106,33 @@ pub(crate) fn log(sink: &mut Sink, at_ns: u64, fact: &LogFact) {
     sink.event(&event);
 }
 
-/// Writes that facts are in no file.
-pub(crate) fn lost(sink: &mut Sink, at_ns: u64, count: u64) {
-    let text =
-        format!("{count} events, clock readings or log lines were not recorded: the recorder was too slow");
-    let data = serde_json::json!({ "lost": count });
-    let (topic, level) = (EventTopic::Events, Level::Warning);
-    sink.event(&Event { topic, at_ns, level, name: "sinew.record", text: &text, data: &data });
+/// Writes the outcome of a confirmed message.
+pub(crate) fn outcome(sink: &mut Sink, at_ns: u64, entry: &OutcomeEntry, names: &Names) {
+    let Ticket { source, destination, correlation } = entry.ticket;
+    let [from, to] = [source, destination].map(|tid| party(tid, names));
+    let (word, why) = match entry.outcome {
+        Outcome::Rejected(why) => ("Rejected".to_owned(), Some(why)),
+        other => (format!("{other:?}"), None),
+    };
+    let reason = why.map_or_else(String::new, |why| format!(" ({why:?})"));
+    let text = format!("message {correlation} from {} to {}: {word}{reason}", from.label(), to.label());
+    let data = json!({
+        "source": from.text, "source_name": from.name, "destination": to.text, "destination_name": to.name,
+        "correlation": correlation, "outcome": word, "why": why.map(|why| format!("{why:?}")),
+    });
+    let level = if entry.outcome == Outcome::Delivered { Level::Debug } else { Level::Warning };
+    let (topic, name) = (EventTopic::Outcomes, from.label());
+    sink.event(&Event { topic, at_ns, level, name, text: &text, data: &data });
+}
+
+/// Writes and counts the facts and outcomes that are in no file.
+pub(crate) fn lost(sink: &mut Sink, at_ns: u64, facts: u64, outcomes: u64) {
+    let lost = [(facts, "events, clock readings or log lines"), (outcomes, "outcomes")];
+    for (count, of) in lost.into_iter().filter(|(count, _)| *count > 0) {
+        let text = format!("{count} {of} were not recorded: the recorder was too slow");
+        let data = json!({ "lost": count, "of": of });
+        let (topic, level) = (EventTopic::Events, Level::Warning);
+        sink.event(&Event { topic, at_ns, level, name: "sinew.record", text: &text, data: &data });
+        sink.lose_events(count);
+    }
 }

@@ -6,7 +6,7 @@ use std::{
 };
 
 use sinew_bag::{BagError, BagWriter, Totals};
-use sinew_record::{Channel, Entry, MessageEntry, PeerClock};
+use sinew_record::{Channel, Entry, Form, MessageEntry, PeerClock};
 use sinew_runtime::{
     tid::{AppAddress, NodeAddress, Tid},
     wire::Kind,
@@ -84,7 +84,7 @@ pub struct Recorder {
     /// The channels of the table, as far as they are known.
     channels: BTreeMap<u16, Channel>,
     places: BTreeMap<u16, Place>,
-    /// Facts that were read, by place.
+    /// Facts and outcomes that were read, by place.
     facts: BTreeMap<u16, u64>,
     held_bytes: usize,
     /// The last record that was read.
@@ -207,18 +207,18 @@ impl Recorder {
         // Where the journal cannot be read any more, the numbers that were read are the last known ones.
         let _ = self.stop();
         self.give_up_before(u64::MAX);
-        let mut lost = 0;
+        let (mut lost, mut lost_outcomes) = (0, 0);
         for (place, seen) in self.until.take().unwrap_or_default() {
-            if self.channels.get(&place).is_some_and(|channel| !channel.form.is_message()) {
-                let read = self.facts.get(&place).copied().unwrap_or(0);
-                lost += seen.saturating_sub(self.before(place)).saturating_sub(read);
-            } else {
+            let form = self.channels.get(&place).map(|channel| channel.form);
+            if form.is_none_or(Form::is_message) {
                 self.catch_up(place, seen, now_ns);
+                continue;
             }
+            let read = self.facts.get(&place).copied().unwrap_or(0);
+            let of_form = if form == Some(Form::Outcome) { &mut lost_outcomes } else { &mut lost };
+            *of_form += seen.saturating_sub(self.before(place)).saturating_sub(read);
         }
-        if lost > 0 {
-            facts::lost(&mut self.sink, now_ns, lost);
-        }
+        facts::lost(&mut self.sink, now_ns, lost, lost_outcomes);
         self.sink.finish(now_ns)
     }
 
@@ -378,6 +378,10 @@ impl Recorder {
                 facts::clocks(&mut self.sink, found.time, &fact.peers, &self.setup.names);
             }
             Entry::Log(fact) => facts::log(&mut self.sink, found.time, fact),
+            Entry::Outcome(entry) if self.setup.chooses_outcome(entry.ticket) => {
+                facts::outcome(&mut self.sink, found.time, entry, &self.setup.names);
+            }
+            Entry::Outcome(_) => {}
             Entry::Message(_) => {}
         }
         Ok(())

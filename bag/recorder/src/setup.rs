@@ -1,7 +1,10 @@
 //! The choice of the messages to record.
 
 use sinew_record::{Channel, Selection};
-use sinew_runtime::tid::{NodeAddress, Tid};
+use sinew_runtime::{
+    outcome::Ticket,
+    tid::{NodeAddress, Tid},
+};
 
 use crate::{channels::is_unreported, names::Names};
 
@@ -34,9 +37,23 @@ impl Setup {
         if selection.is_all() {
             return true;
         }
-        let apps = ends.into_iter().filter_map(|app| Some((names.app(app)?, app)));
         let kinds = names.type_name(kind).map(|name| (name, kind));
-        let chosen = selection.chosen(apps, kinds);
+        let chosen = selection.chosen(self.named(ends), kinds);
         chosen.has(source, destination, kind) || chosen.has(source, to, kind)
+    }
+
+    /// Returns whether the outcome of a message is recorded. Its type is not known.
+    pub(crate) fn chooses_outcome(&self, message: Ticket) -> bool {
+        let Ticket { source, destination, .. } = message;
+        let ends = [source, destination];
+        if self.left_out.iter().any(|app| ends.contains(app)) {
+            return false;
+        }
+        let Self { selection, .. } = self;
+        selection.has_all_apps() || selection.chosen(self.named(ends), []).has_ends(source, destination)
+    }
+
+    fn named(&self, ends: [Tid; 2]) -> impl Iterator<Item = (&str, Tid)> {
+        ends.into_iter().filter_map(|app| Some((self.names.app(app)?, app)))
     }
 }

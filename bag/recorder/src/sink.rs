@@ -43,6 +43,10 @@ impl Sink {
         self.keep(written);
     }
 
+    pub(crate) const fn lose_events(&mut self, count: u64) {
+        self.bag.lose_events(count);
+    }
+
     pub(crate) fn tally(&mut self, now_ns: u64) {
         let written = self.bag.tally(now_ns);
         self.keep(written);

@@ -8,9 +8,11 @@ use std::{
 
 use sinew_bag::{BagWriter, Options, Origin, Totals};
 use sinew_record::{
-    Channel, Entry, Fact, Form, LogFact, MessageEntry, NodeFact, Selection, fact, lost_channel, message_head,
+    Channel, ClockFact, Entry, Fact, Form, LogFact, MessageEntry, NodeFact, OutcomeEntry, PeerClock,
+    Selection, fact, lost_channel, message_head,
 };
 use sinew_runtime::{
+    outcome::{Outcome, Rejection, Ticket},
     protection::{DataId, Stamp, seal},
     tid::{AppAddress, Incarnation, NodeAddress, Tid},
     time::Time,
@@ -247,7 +249,21 @@ fn facts_are_events_and_log_lines() {
     write_fact(&bench.journal, &NodeFact::Barrier { name: "go".to_owned(), generation: 1, waiting, missing });
     let line = LogFact { level: "warn".to_owned(), target: "test".to_owned(), text: "slow".to_owned() };
     write_fact(&bench.journal, &line);
-    assert!(bench.recorder.pump(SECOND).unwrap());
+    let peer = PeerClock {
+        node,
+        incarnation,
+        theirs_minus_ours_ns: -7,
+        bound_ns: 80,
+        drift_ppb: -1_500,
+        drift_bound_ppb: 200,
+    };
+    write_fact(&bench.journal, &ClockFact { wall_offset_ns: 0, peers: vec![peer] });
+    bench.read(SECOND);
+    bench.recorder.pump(3 * SECOND).unwrap();
+    let clocks = read_file(&bench.folder.join("leg.mcap"), "/sinew/clock");
+    let clock: serde_json::Value = serde_json::from_slice(&clocks[0].1).unwrap();
+    let drift = serde_json::json!([clock["offset_ns"], clock["drift_ppb"], clock["drift_bound_ppb"]]);
+    assert_eq!(drift, serde_json::json!([-7, -1_500, 200]));
     let (_, topics) = bench.finish();
     for topic in ["/sinew/events", "/sinew/barriers", "/sinew/log"] {
         assert!(topics.iter().any(|found| found == topic), "{topic}: {topics:?}");
@@ -266,6 +282,38 @@ fn read_file(file: &Path, topic: &str) -> Vec<(BTreeMap<String, String>, Vec<u8>
         }
     }
     found
+}
+
+fn write_outcome(journal: &Journal, source: Tid, correlation: u64, outcome: Outcome) {
+    let ticket = Ticket { source, destination: tid(0x1002), correlation };
+    let record = OutcomeEntry { ticket, outcome }.record();
+    journal.write(Channel::of_node(NODE, Form::Outcome).key(), SECOND, &[&record]);
+}
+
+#[test]
+fn chosen_outcomes_are_written_and_lost_ones_counted() {
+    let mut bench = Bench::new("outcomes", Selection { apps: vec!["hip".into()], ..Selection::default() });
+    let full = Outcome::Rejected(Rejection::QueueFull);
+    write_outcome(&bench.journal, tid(0x1001), 7, full);
+    write_outcome(&bench.journal, tid(0x1003), 8, Outcome::Delivered);
+    write_outcome(&bench.journal, tid(0x1009), 9, Outcome::Delivered);
+    // Two that were overwritten before they were read, say.
+    bench.journal.count(Channel::of_node(NODE, Form::Outcome).key(), 2);
+    bench.read(SECOND);
+    let file = bench.folder.join("leg.mcap");
+    bench.recorder.pump(3 * SECOND).unwrap();
+    let outcomes = read_file(&file, "/sinew/outcomes");
+    assert_eq!(outcomes.len(), 1, "one is of another application, and one of the recorder");
+    let event: serde_json::Value = serde_json::from_slice(&outcomes[0].1).unwrap();
+    let expected = serde_json::json!({
+        "source": tid(0x1001).to_string(), "source_name": "hip",
+        "destination": tid(0x1002).to_string(), "destination_name": "knee",
+        "correlation": 7, "outcome": "Rejected", "why": "QueueFull",
+    });
+    assert_eq!(event["data"], expected);
+    assert_eq!(event["message"], "message 7 from hip to knee: Rejected (QueueFull)");
+    let (totals, _) = bench.finish();
+    assert_eq!((totals.seen, totals.events_lost), (0, 2));
 }
 
 #[test]

@@ -66,6 +66,8 @@ pub(super) struct Part {
     mcap: mcap::Writer<NoSeek<Pending>>,
     /// The channels that every recording has, by their topics.
     fixed: BTreeMap<&'static str, u16>,
+    /// The node that records, in the metadata of each channel: a merged file has those of several incarnations.
+    recorder: BTreeMap<String, String>,
 }
 
 impl fmt::Debug for Part {
@@ -143,6 +145,12 @@ impl Part {
             pending,
             mcap,
             fixed,
+            recorder: [
+                ("sinew.node", origin.address.clone()),
+                ("sinew.incarnation", origin.incarnation.to_string()),
+            ]
+            .map(|(key, value)| (key.to_owned(), value))
+            .into(),
         })
     }
 
@@ -168,22 +176,18 @@ impl Part {
             return Ok(ids);
         }
         let Channel { topic, metadata, companion, .. } = channel;
-        let raw = self.mcap.add_channel(0, topic, "msgpack", metadata).map_err(cause)?;
+        let [own, beside] = [&*metadata, &companion.metadata].map(|own| with(own, &self.recorder));
+        let raw = self.mcap.add_channel(0, topic, "msgpack", &own).map_err(cause)?;
         let (name, encoding, data) = match &companion.view {
             View::Typed(plan) => (plan.name(), "protobuf", plan.descriptor()),
             View::Header => (view::HEADER_TYPE.to_owned(), "protobuf", view::header_descriptor()),
             View::Json => ("sinew.json".to_owned(), "jsonschema", br#"{"type":"object"}"#.to_vec()),
         };
         let schema = self.mcap.add_schema(&name, encoding, &data).map_err(cause)?;
-        let beside =
-            self.mcap.add_channel(schema, &companion.topic, companion.encoding(), &companion.metadata);
-        let ids = [raw, beside.map_err(cause)?];
-        let text = |all: &BTreeMap<String, String>| {
-            all.iter().map(|(key, value)| key.len() + value.len() + 8).sum::<usize>()
-        };
         self.described +=
-            (2 * topic.len() + text(metadata) + text(&companion.metadata) + name.len() + data.len() + 150)
-                as u64;
+            (2 * topic.len() + text(&own) + text(&beside) + name.len() + data.len() + 150) as u64;
+        let beside = self.mcap.add_channel(schema, &companion.topic, companion.encoding(), &beside);
+        let ids = [raw, beside.map_err(cause)?];
         channel.placed = Some((self.number, ids));
         Ok(ids)
     }
@@ -195,8 +199,9 @@ impl Part {
             None => {
                 let schema = self.mcap.add_schema(of.schema, "jsonschema", of.json_schema.as_bytes());
                 let schema = schema.map_err(cause)?;
-                let id = self.mcap.add_channel(schema, of.topic, "json", &BTreeMap::new()).map_err(cause)?;
-                self.described += (of.topic.len() + of.schema.len() + of.json_schema.len() + 100) as u64;
+                let id = self.mcap.add_channel(schema, of.topic, "json", &self.recorder).map_err(cause)?;
+                let own = of.topic.len() + of.schema.len() + of.json_schema.len();
+                self.described += (own + text(&self.recorder) + 100) as u64;
                 self.fixed.insert(of.topic, id);
                 id
             }
@@ -254,6 +259,15 @@ impl Part {
             let _ = fs::remove_file(&self.path);
         }
     }
+}
+
+fn with(own: &BTreeMap<String, String>, more: &BTreeMap<String, String>) -> BTreeMap<String, String> {
+    own.iter().chain(more).map(|(key, value)| (key.clone(), value.clone())).collect()
+}
+
+/// Returns the bytes of metadata in the file.
+fn text(all: &BTreeMap<String, String>) -> usize {
+    all.iter().map(|(key, value)| key.len() + value.len() + 8).sum()
 }
 
 /// Returns the cause of a failed write.

@@ -35,7 +35,7 @@ pub(super) const TALLY: Fixed = Fixed {
 pub(super) const CLOCK: Fixed = Fixed {
     topic: CLOCK_TOPIC,
     schema: "sinew.Clock",
-    json_schema: r#"{"type":"object","properties":{"peer":{"type":"string"},"name":{"type":"string"},"incarnation":{"type":"integer"},"at_ns":{"type":"integer"},"offset_ns":{"type":"integer"},"bound_ns":{"type":"integer"},"drift_ppb":{"type":"integer"}}}"#,
+    json_schema: r#"{"type":"object","properties":{"peer":{"type":"string"},"name":{"type":"string"},"incarnation":{"type":"integer"},"at_ns":{"type":"integer"},"offset_ns":{"type":"integer"},"bound_ns":{"type":"integer"},"drift_ppb":{"type":"integer"},"drift_bound_ppb":{"type":"integer"}}}"#,
 };
 
 /// The schema that the tools of the field have for log lines, and a field for data.
@@ -82,7 +82,7 @@ pub(super) fn clock(origin: &Origin, now_ns: u64, reading: &ClockReading) -> Str
     json!({
         "peer": reading.peer, "name": reading.name, "incarnation": reading.incarnation,
         "at_ns": origin.wall_ns(now_ns), "offset_ns": reading.offset_ns, "bound_ns": reading.bound_ns,
-        "drift_ppb": reading.drift_ppb,
+        "drift_ppb": reading.drift_ppb, "drift_bound_ppb": reading.drift_bound_ppb,
     })
     .to_string()
 }

@@ -46,6 +46,26 @@ fn official_reader_has_all_messages() {
 }
 
 #[test]
+fn each_channel_names_its_recorder_and_incarnation() {
+    let folder = TestFolder::new();
+    let file = folder.path("walk.mcap");
+    let mut bag =
+        BagWriter::create(&file, Options::default(), Origin { incarnation: 7, ..origin() }).unwrap();
+    let channel = angle(&mut bag, Direction::Sent);
+    bag.message(channel, &record(1, SECOND)).unwrap();
+    bag.finish(SECOND).unwrap();
+    let bytes = fs::read(&file).unwrap();
+    let mut topics = BTreeSet::new();
+    for message in mcap::MessageStream::new(&bytes).unwrap().map(Result::unwrap) {
+        let of = |key: &str| message.channel.metadata.get(key).cloned().unwrap_or_default();
+        assert_eq!((of("sinew.node"), of("sinew.incarnation")), ("127.0.0.2".into(), "7".into()));
+        topics.insert(message.channel.topic.clone());
+    }
+    let expected = ["/knee.sensor/exo.angle", "/knee.sensor/exo.angle/view", "/sinew/tally"];
+    assert_eq!(topics, expected.map(str::to_owned).into());
+}
+
+#[test]
 fn second_destination_has_a_topic_of_its_own() {
     let folder = TestFolder::new();
     let file = folder.path("walk.mcap");

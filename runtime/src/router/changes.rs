@@ -139,6 +139,14 @@ impl Router {
         tap.saw(app, passage);
     }
 
+    /// Reports to the tap how many messages of an application are not reported.
+    pub fn observe_missed(&self, app: Tid, missed: u64) {
+        let snapshot = self.snapshot.load();
+        if let Some(tap) = snapshot.table.tap.as_ref().filter(|tap| missed > 0 && tap.watches(app)) {
+            tap.missed(app, missed);
+        }
+    }
+
     /// Sets the guard that checks messages to the applications of this node from now on.
     pub fn set_guard(&self, guard: Arc<dyn Guard>) {
         self.change(|table| table.guard = Some(guard));

@@ -11,6 +11,7 @@
 //! | `orphans` | the stop of the children of a failed supervisor |
 //! | `supervisor_handle` | the handle of a supervisor, for its owner: its children and its commands |
 //! | `ready` | readiness of an actor |
+//! | `restarts` | the observers of restarts |
 //! | `place` | the thread or process of an actor |
 //! | `threads` | the threads of actors |
 //! | `own_system` | an actix system per thread, so that an actor that stops its system does not stop the node |
@@ -35,6 +36,7 @@ mod own_system;
 mod panics;
 mod place;
 mod ready;
+mod restarts;
 mod supervisor;
 mod supervisor_handle;
 mod threads;
@@ -54,6 +56,7 @@ pub use self::{
     panics::UNWINDS,
     place::{Owner, Place},
     ready::{ReadyGate, ReadyPart},
+    restarts::{ActorRestart, RestartObserver, observe_restarts},
     supervisor::{ChildSpec, Launch, PlannedChild, Supervisor, SupervisorFact, SupervisorPlan},
     supervisor_handle::{ChildInfo, SupervisorHandle},
     threads::{Threads, Turn},

@@ -212,6 +212,7 @@ impl Supervisor {
         match order {
             Order::Spawn(id, generation) => {
                 self.note(id, "starting");
+                self.note_restart(id);
                 (self.listener)(SupervisorFact::Starting(id, generation));
                 self.spawn(id, generation);
             }

@@ -3,7 +3,10 @@
 use std::sync::Arc;
 
 use sinew_protocol::observed::Observed;
-use sinew_runtime::{tid::Tid, wire::Header};
+use sinew_runtime::{
+    tid::Tid,
+    wire::{Header, Kind},
+};
 
 use super::Direct;
 use crate::{link::Writer, loan::Draft};
@@ -47,10 +50,11 @@ impl Direct {
         }
     }
 
-    /// Reports a message that was received, if the endpoint is observed.
+    /// Reports a message or an outcome that was received, if the endpoint is observed.
     #[inline]
     pub(crate) fn report_received(&mut self, header: &Header, payload: &[u8], writer: &Arc<Writer>) {
-        if let Some(observer) = self.observer.as_mut().filter(|_| header.kind.is_user()) {
+        let is_reported = header.kind.is_user() || header.kind == Kind::OUTCOME;
+        if let Some(observer) = self.observer.as_mut().filter(|_| is_reported) {
             observer.report(Observed::of(header, payload, false), writer);
         }
     }

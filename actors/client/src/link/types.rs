@@ -1,8 +1,9 @@
 //! The declaration of an endpoint's payload types to its node.
 //!
 //! Finding the structure of a type takes up to some milliseconds, once in a process. So a registration does not wait
-//! for it: types with a known structure are declared before the registration returns, the others by a thread of low
-//! priority.
+//! for it: types with a known structure are declared before the registration returns, the others by a thread. Another
+//! thread, of low priority, finds their structures. The frames are written with the priority of the registration: a
+//! sender waits for the lock of the ring while one is written.
 
 use std::{
     sync::{Arc, Weak},
@@ -85,13 +86,33 @@ impl UsedTypes {
     }
 }
 
+/// Finds the structures of these types on a thread of low priority. Returns their declarations.
+fn declarations(
+    types: &[UsedType],
+    own: Tid,
+    payload_max: usize,
+) -> std::io::Result<Vec<(PayloadType, Message)>> {
+    let find = move || {
+        lower_priority();
+        let all = types.iter().filter_map(|one| Some((one.of, declaration(one, own, payload_max)?)));
+        all.collect()
+    };
+    thread::scope(|scope| {
+        let found = thread::Builder::new().name("structures".to_owned()).spawn_scoped(scope, find)?;
+        // Only the program's own `Deserialize` can panic there: its types are not declared.
+        Ok(found.join().unwrap_or_default())
+    })
+}
+
 /// Declares types as soon as their structures are known.
 fn declare_later(types: &[UsedType], own: Tid, payload_max: usize, writer: &Weak<Writer>) {
-    lower_priority();
+    let found = match declarations(types, own, payload_max) {
+        Ok(found) => found,
+        Err(why) => return log::debug!("the types of {own} are not declared: {why}"),
+    };
     // One limit for all types. Behind it each of the others is tried once.
     let until = Time::now() + WITHIN;
-    for one in types {
-        let Some(frame) = declaration(one, own, payload_max) else { continue };
+    for (of, frame) in found {
         loop {
             let Some(writer) = writer.upgrade() else { return };
             if write(&writer, &frame) {
@@ -99,7 +120,7 @@ fn declare_later(types: &[UsedType], own: Tid, payload_max: usize, writer: &Weak
             }
             drop(writer);
             if Time::now() >= until {
-                log::debug!("type {} of {own} is not declared: no room within {WITHIN:?}", one.of.name());
+                log::debug!("type {} of {own} is not declared: no room within {WITHIN:?}", of.name());
                 break;
             }
             thread::sleep(PAUSE);
@@ -177,6 +198,15 @@ mod tests {
     }
 
     #[derive(Serialize, Deserialize)]
+    struct Speed {
+        value: f32,
+    }
+
+    impl Payload for Speed {
+        const NAME: &'static str = "test.client_types.speed";
+    }
+
+    #[derive(Serialize, Deserialize)]
     struct Own {}
 
     impl Payload for Own {
@@ -208,5 +238,16 @@ mod tests {
         assert_eq!((frame.header.kind, read), (Kind::LNCL_TYPE, expected));
         assert!(angle.is_traced(), "another registration of this process need not wait for it");
         assert!(declaration(one, TID, frame.payload.len() - 1).is_none());
+    }
+
+    #[test]
+    fn structures_are_found_before_any_frame_is_written() {
+        let mut types = UsedTypes::default();
+        let speed = PayloadType::of::<Speed>().expect("the table has room");
+        types.add(speed, Use::Sent);
+        assert!(!speed.is_traced());
+        let found = declarations(&types.0, TID, 4_096).expect("the system has a thread");
+        assert_eq!(found.iter().map(|(of, _)| *of).collect::<Vec<_>>(), [speed]);
+        assert!(speed.is_traced() && declarations(&types.0, TID, 1).is_ok_and(|found| found.is_empty()));
     }
 }

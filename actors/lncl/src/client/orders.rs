@@ -9,7 +9,7 @@ use sinew_protocol::{
 };
 use sinew_runtime::{
     lock,
-    outcome::{Outcome, Rejection, Ticket},
+    outcome::{self, Outcome, Rejection, Ticket},
     router::tap::{Passage, Way},
     tid::Tid,
     time::Time,
@@ -175,6 +175,9 @@ impl Client {
     fn observe(&self, observed: &Observed) {
         let Observed { is_sent, missed, header, length, payload } = observed;
         let (way, own) = if *is_sent { (Way::Out, header.source) } else { (Way::In, header.destination) };
+        if !is_sent && own == self.tid && header.kind == Kind::OUTCOME {
+            return self.observe_outcome(observed);
+        }
         if own != self.tid || !header.kind.is_user() {
             let detail = format!("{} reports a message that is not its own", self.tid);
             return self.server.refusals.count(Time::now(), "report of another's message", &detail);
@@ -182,6 +185,17 @@ impl Client {
         let length = *length as usize;
         let passage = Passage { way, header, payload, length, refused: None };
         self.server.state.ctx.router.observe(self.tid, &passage, u64::from(*missed));
+    }
+
+    /// Shows the outcome of a message that the client has sent on a direct link.
+    fn observe_outcome(&self, observed: &Observed) {
+        let Observed { missed, header, payload, .. } = observed;
+        self.server.state.ctx.router.observe_missed(self.tid, u64::from(*missed));
+        // A byte that is not assigned is no outcome.
+        if let Some(outcome) = payload.first().and_then(|code| Outcome::from_code(*code)) {
+            let Header { source: destination, correlation, .. } = *header;
+            outcome::show(Ticket { source: self.tid, destination, correlation }, outcome);
+        }
     }
 
     fn refuse_message(&self, message: &Message, why: Rejection) {

@@ -12,7 +12,7 @@ use std::{
 };
 
 use sinew_runtime::{
-    outcome::{MemberReport, Outcome, Receipt, ReceiptSink, Rejection, Ticket},
+    outcome::{self, MemberReport, Outcome, Receipt, ReceiptSink, Rejection, Ticket},
     router::MessageSink,
     wire::Message,
 };
@@ -61,6 +61,7 @@ impl Outcomes {
 
     /// Notifies the client of the outcome of a message.
     pub(super) fn send(&self, ticket: Ticket, outcome: Outcome) {
+        outcome::show(ticket, outcome);
         self.answer(Message::outcome(ticket, outcome));
     }
 
@@ -108,6 +109,7 @@ impl ReceiptSink for Outcomes {
 
     // spec: FRAME-7
     fn members(&self, ticket: Ticket, reports: &[MemberReport]) {
+        outcome::show_members(ticket, reports);
         Message::members(ticket, reports, self.payload_max).for_each(|frame| self.answer(frame));
     }
 }

@@ -15,7 +15,7 @@ use sinew_runtime::{
     app::DynApp,
     lock,
     mailbox::{Mailbox, RemoteReader},
-    outcome::{MemberReport, Outcome, Receipt, ReceiptSink, Rejection, Ticket},
+    outcome::{self, MemberReport, Outcome, Receipt, ReceiptSink, Rejection, Ticket},
     router::{MessageSink, SubmitError},
     sender::Sender,
     supervision::Launch,
@@ -418,6 +418,7 @@ struct OutcomeSink(Arc<Link>);
 
 impl ReceiptSink for OutcomeSink {
     fn settle(&self, ticket: Ticket, outcome: Outcome) {
+        outcome::show(ticket, outcome);
         // An error means that the child is gone, or does not read; then its own deadline yields `Unknown`. A
         // later process of this TID uses other correlations.
         let _ = self.0.send(Message::outcome(ticket, outcome));
@@ -425,6 +426,7 @@ impl ReceiptSink for OutcomeSink {
 
     // spec: FRAME-7
     fn members(&self, ticket: Ticket, reports: &[MemberReport]) {
+        outcome::show_members(ticket, reports);
         for frame in Message::members(ticket, reports, self.0.payload_max) {
             // An error has the same consequence, for these members.
             let _ = self.0.send(frame);

@@ -6,14 +6,14 @@ use std::{
     time::Duration,
 };
 
-use sinew_model::facts::LossReason;
-use sinew_record::{Channel, ClockFact, Fact, Form, LogFact, NodeFact, PeerClock, fact};
+use sinew_model::{facts::LossReason, leave_reason::LeaveReason};
+use sinew_record::{Channel, ClockFact, Fact, LogFact, NodeFact, PeerClock, fact};
 use sinew_runtime::{
     lock,
     log::{LogObserver, tracing::Level},
-    tid::{AppAddress, Incarnation, NodeAddress, Tid},
+    supervision::{ActorRestart, RestartObserver},
+    tid::{Incarnation, NodeAddress, Tid},
     time::Time,
-    wire::{Class, Kind},
 };
 use sinew_shm::journal::Journal;
 
@@ -33,24 +33,37 @@ pub(super) struct KnownFacts {
     clocks_due: Time,
 }
 
-/// Returns the key of all facts of a form.
-fn key(node: NodeAddress, form: Form) -> sinew_shm::journal::ChannelKey {
-    let (source, kind) = (Tid::new(node, AppAddress::NONE), Kind::from_bits(0));
-    Channel { source, destination: Tid::NONE, kind, class: Class::Control, form, refused: None }.key()
-}
-
 /// Writes a fact.
 pub(super) fn write<F: Fact>(journal: &Journal, node: NodeAddress, now: Time, of: &F) {
-    journal.write(key(node, F::FORM), now.as_nanos(), &[&fact(of)]);
+    journal.write(Channel::of_node(node, F::FORM).key(), now.as_nanos(), &[&fact(of)]);
 }
 
-/// Writes each event of the process's log.
-pub(super) struct LogWriter {
+/// Writes each event of the process's log, and each restart.
+pub(super) struct FactWriter {
     pub(super) node: NodeAddress,
     pub(super) journal: Arc<Journal>,
 }
 
-impl LogObserver for LogWriter {
+impl RestartObserver for FactWriter {
+    fn restarted(&self, restart: &ActorRestart<'_>) {
+        let ActorRestart { name, supervisor, tid, restarts, why } = *restart;
+        // Other nodes of this process have writers of their own. Layers have no address: each node has their restarts.
+        if tid.is_some_and(|tid| tid.node != self.node) {
+            return;
+        }
+        let fact = NodeFact::Restarted {
+            node: self.node,
+            app: tid.map(|tid| tid.app),
+            name: name.to_owned(),
+            supervisor: supervisor.to_owned(),
+            restarts,
+            why: LeaveReason::of(why).as_str().to_owned(),
+        };
+        write(&self.journal, self.node, Time::now(), &fact);
+    }
+}
+
+impl LogObserver for FactWriter {
     fn wrote(&self, level: Level, target: &str, text: &str) {
         let line = LogFact {
             level: level.as_str().to_ascii_lowercase(),
@@ -183,6 +196,8 @@ pub(crate) fn clocks(state: &NodeState, now: Time) -> Vec<PeerClock> {
             incarnation: member.incarnation,
             theirs_minus_ours_ns: offset.theirs_minus_ours_ns,
             bound_ns: u64::try_from(offset.bound.as_nanos()).unwrap_or(u64::MAX),
+            drift_ppb: offset.drift.ppb,
+            drift_bound_ppb: offset.drift.bound_ppb,
         })
     };
     present.into_iter().filter_map(clock).collect()

@@ -439,11 +439,11 @@ impl Flight {
     }
 
     fn freeze(&self, journal: &Path, order: &SpanOrder, report: RecordReport) {
-        let SpanOrder { trigger, begin_ns, end_ns, replaces } = order;
-        let (id, cause) = (trigger.id.to_string(), trigger.cause.as_str());
+        let SpanOrder { trigger, causes: cause, begin_ns, end_ns, replaces } = order;
+        let id = trigger.id.to_string();
         let span = FrozenSpan {
             id: id.clone(),
-            cause: cause.to_owned(),
+            cause: cause.clone(),
             at_ns: trigger.at_ns,
             bound_ns: trigger.bound_ns,
             begin_ns: *begin_ns,
@@ -456,12 +456,20 @@ impl Flight {
         let freeze = || -> Result<u64, FrozenError> {
             let draft = self.store().draft(&id, &replaces)?;
             // Without the lock: the copy takes as long as the disk does, and questions need the lock.
-            let drafted = draft.copy(journal, &span)?;
-            self.store().keep(&drafted, &facts, &replaces)?;
-            Ok(drafted.records)
+            let records = draft.copy(journal, &span)?;
+            self.store().keep(&facts, &replaces)?;
+            Ok(records)
         };
         match freeze() {
-            Ok(records) => log::warn!(id, cause, records, "the messages around a fault are frozen"),
+            Ok(records) => {
+                log::warn!(id, cause, records, "the messages around a fault are frozen");
+                if let Some(spans) = self.store().is_full() {
+                    log::warn!(
+                        spans,
+                        "all places for frozen spans are taken: further faults are not frozen until these spans are fetched; run `sinew record fetch`, or raise record.frozen_max"
+                    );
+                }
+            }
             Err(error) => log::error!(cause, %error, "the messages around a fault are not frozen"),
         }
     }

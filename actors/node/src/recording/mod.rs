@@ -26,17 +26,19 @@ use std::{
 
 use rustix::time::{ClockId, clock_gettime};
 use sinew_model::context::NodeContext;
-use sinew_record::{NodeFact, RecordTap, Selection};
+use sinew_record::{NodeFact, OutcomeTap, RecordTap, Selection};
 use sinew_runtime::{
     log::{self, LogObserver},
+    outcome::{self, OutcomeObserver},
     router::tap::{Tap, TapOf},
+    supervision::{RestartObserver, observe_restarts},
     tid::Tid,
     time::Time,
     wire::{Kind, known_types},
 };
 use sinew_shm::journal::{CreateJournalError, Journal, Options};
 
-use facts::{KnownFacts, LogWriter};
+use facts::{FactWriter, KnownFacts};
 pub(crate) use flight::Flight;
 pub(crate) use names::{journal_kinds, report};
 pub(crate) use triggers::Triggers;
@@ -82,8 +84,10 @@ struct Active {
     selection: Selection,
     /// The names and addresses of the tap.
     chosen: Option<sinew_record::Chosen>,
-    /// Writes the log, as long as it is here.
-    _log: Arc<dyn LogObserver>,
+    /// Writes outcomes, as long as it is here.
+    outcomes: Option<Arc<dyn OutcomeObserver>>,
+    /// Writes the log and restarts, as long as it is here.
+    _facts: Arc<FactWriter>,
 }
 
 /// A recording that has ended. Its journal may still be copied.
@@ -225,8 +229,9 @@ impl Recording {
             state.programs.clear();
             (state.active.take(), state.configured.take().is_some())
         };
-        let Some(active) = active else { return Ending::default() };
+        let Some(mut active) = active else { return Ending::default() };
         install(node, None);
+        active.outcomes = None;
         let flight = self.flight().cloned();
         if let Some(flight) = &flight {
             flight.finish(node, &active.journal);
@@ -250,6 +255,7 @@ impl Recording {
     fn start(&self, node: &Arc<NodeState>, names: &KnownNames, state: &mut State) -> Result<(), RecordError> {
         if state.active.is_none() {
             let now = Time::now();
+            names::remember_own_types();
             let journal = Arc::new(create(node, now)?);
             let began = NodeFact::Began {
                 node: node.ctx.node,
@@ -264,11 +270,14 @@ impl Recording {
                 journal.remove();
                 return Err(why.into());
             }
-            let log: Arc<dyn LogObserver> =
-                Arc::new(LogWriter { node: node.ctx.node, journal: journal.clone() });
-            // More nodes of one process than have room record without the log.
+            let facts = Arc::new(FactWriter { node: node.ctx.node, journal: journal.clone() });
+            let (log, restarts): (Arc<dyn LogObserver>, Arc<dyn RestartObserver>) =
+                (facts.clone(), facts.clone());
+            // More nodes of one process than have room record without the log and without restarts.
             log::observe(&log);
-            state.active = Some(Active { journal, selection: Selection::default(), chosen: None, _log: log });
+            observe_restarts(&restarts);
+            let selection = Selection::default();
+            state.active = Some(Active { journal, selection, chosen: None, outcomes: None, _facts: facts });
         }
         self.settle(node, names, state);
         Ok(())
@@ -357,6 +366,11 @@ impl Active {
         if self.chosen.as_ref() != Some(&chosen) {
             let tap = RecordTap::new(node.ctx.node, self.journal.clone(), chosen.clone());
             install(node, Some(Arc::new(tap)));
+            let outcomes = OutcomeTap::new(node.ctx.node, self.journal.clone(), chosen.clone());
+            let outcomes: Arc<dyn OutcomeObserver> = Arc::new(outcomes);
+            // More nodes of one process than have room record without outcomes.
+            outcome::observe(&outcomes, self.outcomes.as_ref());
+            self.outcomes = Some(outcomes);
             self.chosen = Some(chosen);
         }
     }

@@ -3,23 +3,36 @@
 use std::{collections::BTreeSet, path::Path};
 
 use sinew_lncl::undelivered::kind_name;
-use sinew_model::directory::DirectoryEntry;
+use sinew_model::{
+    barrier::{ArriveAtBarrier, BarrierAnswer, LeaveBarrier},
+    directory::DirectoryEntry,
+};
 use sinew_record::{Channel, RecordReport, RecordedApp, RecordedType};
 use sinew_runtime::{
     lock,
     tid::Tid,
     time::Time,
-    wire::{Kind, known_types},
+    wire::{self, Kind, PayloadType, known_types},
 };
 use sinew_shm::journal::{JournalReader, Start};
 
 use super::{facts::clocks, wall_offset};
-use crate::NodeState;
+use crate::{NodeState, inspect::Ping};
 
 /// Maximum number of payload types with a structure beside a journal. A reader without a node cannot ask for more.
 const READER_SCHEMAS_MAX: usize = 256;
 /// Maximum bytes of these structures: the names have room in the same file, of 4 MiB.
 const READER_SCHEMA_BYTES_MAX: usize = 1 << 20;
+
+/// Records the payload types of Sinew that messages of applications have. A node that only receives them would not know
+/// their names.
+pub(super) fn remember_own_types() {
+    wire::remember_own_types();
+    // A full table shows their IDs.
+    let _ = PayloadType::of::<Ping>();
+    let _ = (PayloadType::of::<ArriveAtBarrier>(), PayloadType::of::<LeaveBarrier>());
+    let _ = PayloadType::of::<BarrierAnswer>();
+}
 
 /// Returns the names and structures for a reader of the journal at this path, which may have no node to ask.
 pub(super) fn names_for_reader(state: &NodeState, path: &Path) -> RecordReport {
@@ -108,10 +121,8 @@ pub(crate) fn journal_kinds(path: &Path) -> Vec<Kind> {
 
 #[cfg(test)]
 mod tests {
-    use sinew_record::{FrozenFacts, RECORDED_MAX};
-    use sinew_runtime::{tid::Tid, wire};
-
     use super::*;
+    use sinew_record::{FrozenFacts, RECORDED_MAX};
 
     #[test]
     fn facts_of_many_applications_can_be_read() {

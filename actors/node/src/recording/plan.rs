@@ -8,6 +8,8 @@
 //! - Of a group the trigger with the smallest ID decides: the span has its ID. The span begins with the earliest begin
 //!   of all triggers of the group, and ends with their latest end.
 //!
+//! A cause within `after` of a known trigger makes no trigger. Its words are kept for the name of the span.
+//!
 //! A trigger that arrives after a group was frozen can change the group. Then the right span is frozen in place of the
 //! former ones. All times are nanoseconds of this node's monotonic clock.
 
@@ -28,6 +30,10 @@ const MEMORY_NS: u64 = 30_000_000_000;
 const FUTURE_NS: u64 = 1_000_000_000;
 /// Maximum number of known triggers. Further ones are counted.
 const TRIGGERS_MAX: usize = 256;
+/// Maximum number of causes without a trigger of which the words are kept. Further ones are counted.
+const COVERED_MAX: usize = 64;
+/// Maximum number of causes that the name of a span has. Further ones are counted in it.
+const NAMED_MAX: usize = 8;
 /// Limits of the times in a trigger: those of the configuration.
 const SECONDS_MIN: u64 = 1;
 const KEEP_SECONDS_MAX: u64 = 600;
@@ -72,6 +78,11 @@ impl Trigger {
         self.at_ns.saturating_add(nanos(self.after))
     }
 
+    /// Returns whether a cause at this time needs no trigger of its own.
+    fn covers(&self, at_ns: u64) -> bool {
+        at_ns.abs_diff(self.at_ns) <= nanos(self.after)
+    }
+
     /// Returns whether its times are those of a configuration.
     fn is_legal(&self) -> bool {
         let least = Duration::from_secs(SECONDS_MIN);
@@ -99,6 +110,8 @@ pub(crate) enum Output {
 pub(crate) struct SpanOrder {
     /// The trigger that decides.
     pub(crate) trigger: Trigger,
+    /// The causes that this node knows, in the order of their times: at most 8, and the number of the others.
+    pub(crate) causes: String,
     /// The first nanosecond of the span.
     pub(crate) begin_ns: u64,
     /// The last one.
@@ -117,12 +130,23 @@ pub(crate) struct FreezePlan {
     /// The number of the last trigger of this node.
     last: u32,
     known: BTreeMap<TriggerId, Trigger>,
+    /// Causes at this node that made no trigger.
+    covered: Vec<CoveredCause>,
     /// The known triggers of which the span was frozen, with its begin and its end.
     frozen: BTreeMap<TriggerId, (u64, u64)>,
     /// Triggers to forward: at most one for each known trigger.
     outbox: VecDeque<Trigger>,
     /// Triggers that were refused: there were too many, or their times are wrong.
     refused: u64,
+}
+
+/// A cause within `after` of a known trigger.
+#[derive(Debug)]
+struct CoveredCause {
+    at_ns: u64,
+    cause: LeaveReason,
+    /// Further causes of which there was no room for the words.
+    further: u64,
 }
 
 /// Triggers that have one span.
@@ -154,14 +178,37 @@ impl<'a> Group<'a> {
     }
 
     /// Returns the order to freeze its span, unless that is frozen and no other span of its triggers is.
-    fn order(&self, frozen: &BTreeMap<TriggerId, (u64, u64)>) -> Option<SpanOrder> {
+    fn order(&self, plan: &FreezePlan) -> Option<SpanOrder> {
+        let FreezePlan { frozen, covered, .. } = plan;
         let replaces: Vec<_> =
             self.members.iter().map(|member| member.id).filter(|id| frozen.contains_key(id)).collect();
         if replaces == [self.winner.id] && frozen.get(&self.winner.id) == Some(&self.span()) {
             return None;
         }
         let (trigger, (begin_ns, end_ns)) = (self.winner.clone(), self.span());
-        Some(SpanOrder { trigger, begin_ns, end_ns, replaces })
+        Some(SpanOrder { trigger, causes: self.causes(covered), begin_ns, end_ns, replaces })
+    }
+
+    /// Returns the words of all causes, each text once, in the order of their times.
+    fn causes(&self, covered: &[CoveredCause]) -> String {
+        let has = |other: &&CoveredCause| self.members.iter().any(|member| member.covers(other.at_ns));
+        let (mut further, mut all) = (0_u64, Vec::new());
+        for CoveredCause { at_ns, cause, further: more } in covered.iter().filter(has) {
+            further += more;
+            all.push((*at_ns, cause.as_str()));
+        }
+        all.extend(self.members.iter().map(|member| (member.at_ns, member.cause.as_str())));
+        all.sort_unstable();
+        let mut named: Vec<&str> = Vec::new();
+        for (_, cause) in all {
+            if !named.contains(&cause) {
+                named.push(cause);
+            }
+        }
+        further += named.len().saturating_sub(NAMED_MAX) as u64;
+        named.truncate(NAMED_MAX);
+        let rest = if further == 0 { String::new() } else { format!("; and {further} more") };
+        named.join("; ") + &rest
     }
 }
 
@@ -178,22 +225,22 @@ impl FreezePlan {
             after,
             last: 0,
             known: BTreeMap::new(),
+            covered: Vec::new(),
             frozen: BTreeMap::new(),
             outbox: VecDeque::new(),
             refused: 0,
         }
     }
 
-    /// Handles a cause at this node. Returns the trigger that stands for it: a new one, or that of a span that has the
-    /// cause already. `None` if there are too many.
+    /// Handles a cause at this node. Returns the trigger of the span that has the cause; a trigger that arrives later
+    /// can change it. `None` if there are too many.
     pub(crate) fn happened(&mut self, now_ns: u64, at_ns: u64, cause: &str) -> Option<TriggerId> {
         self.prune(now_ns);
-        let has = |group: &Group<'_>| {
-            let first = group.members[0];
-            at_ns.abs_diff(first.at_ns) <= nanos(first.after)
-        };
-        if let Some(group) = self.groups().iter().find(|group| has(group)) {
-            return Some(group.winner.id);
+        let covers = |group: &&Group<'_>| group.members.iter().any(|member| member.covers(at_ns));
+        let covering = self.groups().iter().find(covers).map(|group| group.winner.id);
+        if let Some(id) = covering {
+            self.cover(at_ns, cause);
+            return Some(id);
         }
         let number = self.last.checked_add(1)?;
         let id = TriggerId { node: self.node, incarnation: self.incarnation, number };
@@ -204,7 +251,27 @@ impl FreezePlan {
         }
         self.outbox.push_back(trigger);
         self.last = number;
-        Some(id)
+        let group =
+            self.groups().into_iter().find(|group| group.members.iter().any(|member| member.id == id));
+        Some(group.map_or(id, |group| group.winner.id))
+    }
+
+    /// Keeps the words of a cause that makes no trigger.
+    fn cover(&mut self, at_ns: u64, cause: &str) {
+        let cause = LeaveReason::of(cause);
+        let is_same = |known: &LeaveReason| *known == cause;
+        let is_named = self.known.values().any(|trigger| trigger.covers(at_ns) && is_same(&trigger.cause));
+        // A name has each text once. That of an earlier group counts for itself.
+        let after_ns = nanos(self.after);
+        let is_kept = |other: &CoveredCause| is_same(&other.cause) && at_ns.abs_diff(other.at_ns) <= after_ns;
+        if is_named || self.covered.iter().any(is_kept) {
+            return;
+        }
+        if self.covered.len() < COVERED_MAX {
+            self.covered.push(CoveredCause { at_ns, cause, further: 0 });
+        } else if let Some(last) = self.covered.last_mut() {
+            last.further += 1;
+        }
     }
 
     /// Handles the trigger of another node. Returns whether it is new here.
@@ -237,7 +304,7 @@ impl FreezePlan {
             return Some(Output::Forward(trigger));
         }
         let is_due = |group: &&Group<'_>| due_ns(group.end_ns) <= now_ns;
-        let order = self.groups().iter().filter(is_due).find_map(|group| group.order(&self.frozen))?;
+        let order = self.groups().iter().filter(is_due).find_map(|group| group.order(self))?;
         for id in &order.replaces {
             self.frozen.remove(id);
         }
@@ -270,7 +337,7 @@ impl FreezePlan {
         self.groups().iter().map(|group| (group.winner.id, group.span())).collect()
     }
 
-    /// Returns the groups, by time.
+    /// Returns the groups, by time. spec: BAG-7
     fn groups(&self) -> Vec<Group<'_>> {
         let mut by_time: Vec<_> = self.known.values().collect();
         by_time.sort_by_key(|trigger| (trigger.at_ns, trigger.id));
@@ -298,6 +365,8 @@ impl FreezePlan {
             self.known.remove(&id);
             self.frozen.remove(&id);
         }
+        let Self { known, covered, .. } = self;
+        covered.retain(|cause| known.values().any(|trigger| trigger.covers(cause.at_ns)));
     }
 }
 

@@ -10,7 +10,7 @@ use std::{
 };
 
 use sinew_runtime::{lock, log, wire};
-use sinew_shm::journal::{CopyJournalError, JournalReader, Start, copy_span, count_span};
+use sinew_shm::journal::{CopyJournalError, JournalReader, Start, copy_joined};
 
 use sinew_record::{
     FROZEN_SPANS_MAX, FrozenFacts, FrozenPart, FrozenSpan,
@@ -36,34 +36,18 @@ pub(crate) struct FrozenStore {
 pub(crate) struct Draft {
     /// The ring of the copy.
     target: PathBuf,
-    /// The rings of the spans that it replaces.
+    /// The rings of the spans that it replaces, in the order of their times.
     former: Vec<PathBuf>,
 }
 
-/// A finished copy.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub(crate) struct Drafted {
-    /// The ring with the most records of the span: the copy, or that of a replaced span.
-    ring: PathBuf,
-    /// Its records of the span.
-    pub(crate) records: u64,
-}
-
 impl Draft {
-    /// Copies the span of the journal.
-    pub(crate) fn copy(&self, journal: &Path, span: &FrozenSpan) -> Result<Drafted, FrozenError> {
+    /// Copies the span of the journal, with the records that the journal has lost and the replaced spans still have.
+    /// Returns the number of records.
+    pub(crate) fn copy(&self, journal: &Path, span: &FrozenSpan) -> Result<u64, FrozenError> {
         let times = span.begin_ns..=span.end_ns;
+        let copied = copy_joined(&self.former, journal, &self.target, &times);
         let failed = |cause| FrozenError::Copy { id: span.id.clone(), cause };
-        let copied = copy_span(journal, &self.target, &times).map_err(failed)?;
-        let mut best = Drafted { ring: self.target.clone(), records: copied.records };
-        for ring in &self.former {
-            // One that cannot be read has no records to keep.
-            let records = count_span(ring, &times).unwrap_or(0);
-            if records > best.records {
-                best = Drafted { ring: ring.clone(), records };
-            }
-        }
-        Ok(best)
+        copied.map(|copied| copied.records).map_err(failed)
     }
 }
 
@@ -129,27 +113,22 @@ impl FrozenStore {
     /// Makes room for the copy of a span, which replaces others. Those stay until the copy is there.
     pub(crate) fn draft(&mut self, id: &str, replaces: &[String]) -> Result<Draft, FrozenError> {
         self.make_room(id, replaces)?;
-        let former = replaces.iter().map(|id| self.path(id, "frozen")).filter(|ring| is_own(ring)).collect();
+        let spans = self.spans().into_iter().filter(|span| replaces.contains(&span.id));
+        let former = spans.map(|span| self.path(&span.id, "frozen")).collect();
         Ok(Draft { target: self.path(id, "draft"), former })
     }
 
     /// Takes the copy of a span, and removes the spans that it replaces.
-    ///
-    /// A replaced span that has more records of this one stays, under the ID of this one: the journal has lost them.
-    pub(crate) fn keep(
-        &mut self,
-        drafted: &Drafted,
-        facts: &FrozenFacts,
-        replaces: &[String],
-    ) -> Result<(), FrozenError> {
+    pub(crate) fn keep(&mut self, facts: &FrozenFacts, replaces: &[String]) -> Result<(), FrozenError> {
         let id = facts.span.as_ref().map(|span| span.id.clone()).unwrap_or_default();
         let ring = self.path(&id, "frozen");
         let failed = |cause| FrozenError::Files { id: id.clone(), cause };
         // The facts first: without its ring a span does not count, and a ring without facts is removed.
-        let renamed = || fs::rename(&drafted.ring, &ring).map_err(failed);
+        let draft = self.path(&id, "draft");
+        let renamed = || fs::rename(&draft, &ring).map_err(failed);
         let kept = self.announce(&id, facts).and_then(|()| renamed());
-        // It is there only after an error, or if a replaced ring was better.
-        let _ = fs::remove_file(self.path(&id, "draft"));
+        // It is there only after an error.
+        let _ = fs::remove_file(&draft);
         kept?;
         self.fetched.remove(&id);
         replaces.iter().filter(|former| **former != id).for_each(|former| self.discard(former));
@@ -258,6 +237,13 @@ impl FrozenStore {
         Ok(())
     }
 
+    /// Returns the number of spans if there is no room for one more.
+    pub(crate) fn is_full(&self) -> Option<usize> {
+        let spans = self.spans();
+        let is_full = spans.len() >= self.spans_max && !spans.iter().any(|span| span.is_fetched);
+        is_full.then_some(spans.len())
+    }
+
     /// Removes a span.
     pub(crate) fn discard(&self, id: &str) {
         for extension in ["facts", "frozen"] {
@@ -363,8 +349,8 @@ pub(crate) fn move_ring(from: &FrozenStore, to: &Mutex<FrozenStore>, id: &str) -
     let (ring, facts) = from.files(id)?;
     let draft = lock(to).draft(id, &[])?;
     let span = facts.span.clone().unwrap_or_default();
-    let drafted = draft.copy(&ring, &span)?;
-    lock(to).keep(&drafted, &facts, &[])?;
+    draft.copy(&ring, &span)?;
+    lock(to).keep(&facts, &[])?;
     from.discard(id);
     Ok(())
 }

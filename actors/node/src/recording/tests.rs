@@ -7,7 +7,9 @@ use sinew_model::config::NodeConfig;
 use sinew_record::{Channel, ClockFact, Entry, Fact as _, Form};
 use sinew_runtime::{
     incident::{self, IncidentKind},
+    outcome::{Outcome, Ticket},
     router::{LocalRoute, MessageSink, SubmitError},
+    supervision::ActorRestart,
     tid::{AppAddress, Incarnation},
     wire::{Header, Message, Payload},
 };
@@ -68,7 +70,7 @@ fn read(path: &Path) -> (Vec<Vec<u8>>, Vec<Form>) {
         let form = Channel::of(channel.key.expect("its key")).expect("a channel").form;
         match Entry::read(&bytes).expect("a record") {
             Entry::Message(message) => messages.push(message.payload.expect("it is there").to_vec()),
-            Entry::Node(_) | Entry::Clock(_) | Entry::Log(_) => facts.push(form),
+            Entry::Node(_) | Entry::Clock(_) | Entry::Log(_) | Entry::Outcome(_) => facts.push(form),
         }
     }
     (messages, facts)
@@ -96,6 +98,59 @@ fn program_has_its_messages_recorded_until_it_leaves() {
         assert!(Time::now() < deadline, "waited for the end of the thread");
         std::thread::yield_now();
     }
+}
+
+/// Calls a function with each record in the journal. Facts and outcomes of other tests of this process are there, too.
+fn each_entry(path: &Path, mut each: impl FnMut(Entry<'_>)) {
+    let mut reader = JournalReader::open(path, Start::Oldest).expect("it is there");
+    let mut bytes = Vec::new();
+    while reader.next(0, &mut bytes).expect("it is whole").is_some() {
+        each(Entry::read(&bytes).expect("a record"));
+    }
+}
+
+#[test]
+fn restart_of_an_own_actor_is_a_fact() {
+    const NAME: &str = "a hip that restarts";
+    let node = node("restarts", |_| {});
+    let hip = app(&node, "hip");
+    let path = node.recording.ask(&node, hip, Selection::default(), Time::now()).expect("it begins");
+    let writer = FactWriter { node: node.ctx.node, journal: lock_journal(&node) };
+    let elsewhere = Tid::new(sinew_runtime::tid::NodeAddress::new(9), hip.app);
+    for (tid, restarts) in [(Some(hip), 3), (Some(elsewhere), 1), (None, 2)] {
+        let (name, supervisor, why) = (NAME, "applications", "panicked\nat night");
+        writer.restarted(&ActorRestart { name, supervisor, tid, restarts, why });
+    }
+    let mut found = Vec::new();
+    each_entry(&path, |entry| match entry {
+        Entry::Node(NodeFact::Restarted { app, restarts, why, name, .. }) if name == NAME => {
+            assert_eq!(why, "panicked at night");
+            found.push((app, restarts));
+        }
+        Entry::Message(_) | Entry::Node(_) | Entry::Clock(_) | Entry::Log(_) | Entry::Outcome(_) => {}
+    });
+    assert_eq!(found, [(Some(hip.app), 3), (None, 2)]);
+    node.recording.leave(&node, hip);
+}
+
+#[test]
+fn outcomes_are_recorded_from_the_begin_on() {
+    const NUMBER: u64 = 0x7707_7077;
+    let node = node("outcomes", |_| {});
+    let hip = app(&node, "hip");
+    let show = |outcome| {
+        outcome::show(Ticket { source: hip, destination: hip, correlation: NUMBER }, outcome);
+    };
+    show(Outcome::Failed);
+    let path = node.recording.ask(&node, hip, Selection::default(), Time::now()).expect("it begins");
+    show(Outcome::Delivered);
+    let mut found = Vec::new();
+    each_entry(&path, |entry| match entry {
+        Entry::Outcome(entry) if entry.ticket.correlation == NUMBER => found.push(entry.outcome),
+        Entry::Message(_) | Entry::Node(_) | Entry::Clock(_) | Entry::Log(_) | Entry::Outcome(_) => {}
+    });
+    assert_eq!(found, [Outcome::Delivered]);
+    node.recording.leave(&node, hip);
 }
 
 // spec: INSPECT-9
@@ -143,6 +198,11 @@ fn type_only_sent_has_its_name_and_structure() {
     assert_eq!(types[0].kind, Torque::KIND, "those of the question stand first");
     let structure = Torque::KIND.schema().expect("it is known").expect("it has a structure");
     assert_eq!(types[0].schema, Some(structure.schema().encode()));
+    // And: types that no application of this node has sent have names, if they are of Sinew
+    let names = KnownNames::of(&node).kinds;
+    for name in ["sinew.echo", "sinew.ping", "sinew.param.set", "sinew.barrier.arrive"] {
+        assert_eq!(names.get(&Kind::named(name)).map(String::as_str), Some(name));
+    }
     // And: its name can be selected.
     assert_eq!(KnownNames::of(&node).kinds.get(&Torque::KIND).map(String::as_str), Some(Torque::NAME));
     node.recording.close(&node);

@@ -30,6 +30,9 @@ use super::trace::{EventRow, Recording, TraceRow};
 use super::watch::WatchParts;
 use super::{coordinator, drive, gait, sensor, slots, watch};
 
+/// Maximum tries to create a folder. At most the other nodes of the robot end meanwhile, each once.
+const FOLDER_TRIES: usize = 8;
+
 /// The command line of a process.
 #[derive(Debug, Clone, clap::Args)]
 pub struct NodeOptions {
@@ -180,10 +183,22 @@ fn run_node(part: Part, topology: &Topology, options: &NodeOptions) -> Result<Ex
 /// Creates the folders of the flight recorder, for this user alone.
 fn create_folders(config: &RecordConfig) -> Result<(), NodeError> {
     for folder in [&config.folder, &config.frozen_folder].into_iter().flatten() {
-        let created = DirBuilder::new().recursive(true).mode(0o700).create(folder);
+        let created = create_again(|| DirBuilder::new().recursive(true).mode(0o700).create(folder));
         created.map_err(|cause| NodeError::Folder { path: folder.display().to_string(), cause })?;
     }
     Ok(())
+}
+
+/// Creates a folder and those around it. A node that ends just now may remove the folder around those of all nodes
+/// before this one is in it: then both are created again.
+fn create_again(mut create: impl FnMut() -> io::Result<()>) -> io::Result<()> {
+    for _ in 1..FOLDER_TRIES {
+        match create() {
+            Err(error) if error.kind() == io::ErrorKind::NotFound => {}
+            other => return other,
+        }
+    }
+    create()
 }
 
 /// Removes the journal of the flight recorder after the node's end, also where the process that started it was killed.
@@ -273,3 +288,7 @@ fn stop_on_signals(stop: Arc<AtomicBool>) -> Result<(), NodeError> {
     std::thread::Builder::new().name("signals".to_owned()).spawn(wait).map_err(NodeError::Thread)?;
     Ok(())
 }
+
+#[cfg(test)]
+#[path = "../../tests/unit/node.rs"]
+mod tests;

@@ -1,6 +1,11 @@
 //! Copies a span of a journal into a smaller journal, while the writers continue.
 
-use std::{io, ops::RangeInclusive, path::Path};
+use std::{
+    collections::BTreeMap,
+    io,
+    ops::RangeInclusive,
+    path::{Path, PathBuf},
+};
 
 use super::{
     error::{CopyJournalError, CreateJournalError, ReadJournalError},
@@ -69,13 +74,21 @@ pub fn copy_span(
     target: &Path,
     span: &RangeInclusive<u64>,
 ) -> Result<Copied, CopyJournalError> {
-    let (mut bytes, mut longest) = (0_u64, 0_u64);
-    each_record::<ReadJournalError>(source, span, |_, payload| {
-        let length = record_bytes(payload.len());
-        bytes = bytes.saturating_add(length);
-        longest = longest.max(length);
-        Ok(())
-    })?;
+    copy_joined(&[], source, target, span)
+}
+
+/// Same as [`copy_span`], with the records that the source has lost and former copies of it still have. The copies are
+/// in the order of their times. One that cannot be read is left out.
+///
+/// # Errors
+/// As [`copy_span`].
+pub fn copy_joined(
+    former: &[PathBuf],
+    source: &Path,
+    target: &Path,
+    span: &RangeInclusive<u64>,
+) -> Result<Copied, CopyJournalError> {
+    let Parts { parts, bytes, longest } = Parts::measure(former, source, span)?;
     // The longest record fits into a quarter of the ring.
     let ring_bytes = bytes.max(longest.saturating_mul(4)).clamp(RING_MIN, RING_MAX).next_power_of_two();
     let reader = JournalReader::open(source, Start::Newest)?;
@@ -99,12 +112,14 @@ pub fn copy_span(
         file.put(0, &page).map_err(failed)?;
         file.put(WALL_OFFSET_AT, &wall_offset.to_ne_bytes()).map_err(failed)?;
         let mut ring = Ring { file, salt: header.salt, room: ring_bytes, position: 0, waiting: Vec::new() };
-        each_record::<CopyJournalError>(source, span, |record, payload| {
-            if ring.push(record, payload).map_err(failed)? {
-                copied.add(record.time);
-            }
-            Ok(())
-        })?;
+        for (Part { path, .. }, at) in parts.iter().zip(1_usize..) {
+            each_record::<CopyJournalError>(path, span, |record, payload| {
+                if !has(&parts[at..], record) && ring.push(record, payload).map_err(failed)? {
+                    copied.add(record.time);
+                }
+                Ok(())
+            })?;
+        }
         ring.flush().map_err(failed)?;
         // Last: each record that was copied has its place in the table.
         let table: Vec<u8> = reader.table()?.into_iter().flat_map(u64::to_ne_bytes).collect();
@@ -116,17 +131,61 @@ pub fn copy_span(
     Ok(copied)
 }
 
-/// Returns the number of records with times within `span` in the journal at `path`.
-///
-/// # Errors
-/// The journal cannot be read.
-pub fn count_span(path: &Path, span: &RangeInclusive<u64>) -> Result<u64, ReadJournalError> {
-    let mut records = 0;
-    each_record::<ReadJournalError>(path, span, |_, _| {
-        records += 1;
+/// One of the journals that are copied.
+struct Part<'a> {
+    path: &'a Path,
+    /// First and last number of each place, within the span.
+    numbers: BTreeMap<u16, (u64, u64)>,
+}
+
+/// The journals that are copied, the source as the last one, and the size of their records without repeated ones.
+struct Parts<'a> {
+    parts: Vec<Part<'a>>,
+    bytes: u64,
+    longest: u64,
+}
+
+impl<'a> Parts<'a> {
+    fn measure(
+        former: &'a [PathBuf],
+        source: &'a Path,
+        span: &RangeInclusive<u64>,
+    ) -> Result<Self, ReadJournalError> {
+        let mut all = Self { parts: Vec::new(), bytes: 0, longest: 0 };
+        all.add(source, span)?;
+        for path in former.iter().rev() {
+            // It has nothing to keep then.
+            let _ = all.add(path, span);
+        }
+        Ok(all)
+    }
+
+    /// Adds a journal in front of the others.
+    fn add(&mut self, path: &'a Path, span: &RangeInclusive<u64>) -> Result<(), ReadJournalError> {
+        let (mut bytes, mut longest, mut numbers) = (0_u64, 0, BTreeMap::new());
+        each_record::<ReadJournalError>(path, span, |record, payload| {
+            let (first, last) = numbers.entry(record.place).or_insert((record.number, record.number));
+            (*first, *last) = ((*first).min(record.number), (*last).max(record.number));
+            if !has(&self.parts, record) {
+                let length = record_bytes(payload.len());
+                bytes = bytes.saturating_add(length);
+                longest = longest.max(length);
+            }
+            Ok(())
+        })?;
+        self.bytes = self.bytes.saturating_add(bytes);
+        self.longest = self.longest.max(longest);
+        self.parts.insert(0, Part { path, numbers });
         Ok(())
-    })?;
-    Ok(records)
+    }
+}
+
+/// Returns whether one of these journals has the record.
+fn has(parts: &[Part<'_>], record: &Record) -> bool {
+    parts.iter().any(|part| {
+        let numbers = part.numbers.get(&record.place);
+        numbers.is_some_and(|(first, last)| (*first..=*last).contains(&record.number))
+    })
 }
 
 /// The ring of a copy. Its records lie one after the other, from its start.

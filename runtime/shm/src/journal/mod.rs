@@ -47,7 +47,7 @@ mod writer;
 
 #[cfg(not(loom))]
 pub use self::{
-    copy::{Copied, copy_span, count_span, each_record},
+    copy::{Copied, copy_joined, copy_span, each_record},
     reader::{Channel, JournalReader, Record, Start, Tally},
     writer::{Journal, Options},
 };

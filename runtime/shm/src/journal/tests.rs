@@ -11,7 +11,7 @@ use proptest::prelude::*;
 
 use super::{
     ChannelKey, Copied, CreateJournalError, Journal, JournalHeaderError, JournalReader, Options,
-    ReadJournalError, Start, copy_span,
+    ReadJournalError, Start, copy_joined, copy_span,
     layout::{HEADER_BYTES, RING_AT, TABLE_AT, TABLE_BYTES},
     platform,
 };
@@ -211,6 +211,36 @@ fn copied_span_keeps_times_and_numbers() {
     let records: u64 = (0..1_000).map(|_| u64::from(journal.write(KEY, 200, &[&[9; 300]]))).sum();
     assert_eq!(copy_span(&folder.path(), &target, &(1..=100)).unwrap().records, 0);
     assert_eq!(records, 1_000);
+}
+
+#[test]
+fn joined_copy_has_the_lost_records_of_former_ones() {
+    let folder = Folder::new("joined");
+    let [first, second, target] = ["first", "second", "third"].map(|name| folder.0.join(name));
+    let journal = Journal::create(&folder.path(), &small()).unwrap();
+    let write = |times: std::ops::RangeInclusive<u64>| {
+        for time in times {
+            assert!(journal.write(KEY, time, &[&[7; 300]]));
+        }
+    };
+    write(1..=20);
+    copy_span(&folder.path(), &first, &(5..=20)).unwrap();
+    write(21..=30);
+    copy_span(&folder.path(), &second, &(15..=30)).unwrap();
+    // The ring loses all of these.
+    write(31..=1_000);
+    let former = [first, folder.0.join("absent"), second];
+    let copied = copy_joined(&former, &folder.path(), &target, &(8..=995)).unwrap();
+    let mut reader = JournalReader::open(&target, Start::Oldest).unwrap();
+    let (mut payload, mut found) = (Vec::new(), Vec::new());
+    while let Some(record) = reader.next(0, &mut payload).unwrap() {
+        assert_eq!((record.number, payload.len()), (record.time, 300));
+        found.push(record.time);
+    }
+    assert_eq!(copied.records, found.len() as u64);
+    assert_eq!(found[..23], (8..=30).collect::<Vec<_>>()[..], "each once, in their order");
+    let rest: Vec<_> = (found[23]..=995).collect();
+    assert!(found[23] > 31 && found[23..] == rest[..]);
 }
 
 #[test]

@@ -3,7 +3,12 @@
 use super::Supervisor;
 use crate::{
     incident::{self, IncidentKind},
-    supervision::{Reason, core::ChildId, supervisor_handle::ChildRecord},
+    supervision::{
+        Reason,
+        core::ChildId,
+        restarts::{ActorRestart, show},
+        supervisor_handle::ChildRecord,
+    },
     time::Time,
 };
 
@@ -13,6 +18,16 @@ impl Supervisor {
         let ChildRecord { supervisor, generation, restarts } = self.own_handle.record(id);
         let (child, tid, waiting) = (self.own_handle.name(id), self.tid_of(id), self.waiting(id));
         crate::log::debug!(supervisor, child, tid, generation, restarts, waiting, "{what}");
+    }
+
+    /// Shows a restart to its observers. Another try of a start that has failed is none.
+    pub(super) fn note_restart(&self, id: ChildId) {
+        let last = self.own_handle.tree.borrow().child(id).and_then(|child| child.last_reason);
+        let Some(why) = last.filter(|why| !matches!(why, Reason::StartFailed(_))) else { return };
+        let ChildRecord { supervisor, restarts, .. } = self.own_handle.record(id);
+        let (name, why) = (self.own_handle.name(id), self.own_handle.name_children(why).to_string());
+        let tid = self.children.get(&id).and_then(|child| child.spec.tid);
+        show(&ActorRestart { name: &name, supervisor: &supervisor, tid, restarts, why: &why });
     }
 
     pub(super) fn note_end(&mut self, id: ChildId, reason: &Reason) {

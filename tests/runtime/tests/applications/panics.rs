@@ -3,6 +3,7 @@
 
 use std::{
     sync::{
+        Arc, Mutex,
         atomic::{AtomicU64, Ordering},
         mpsc::{Receiver, SyncSender, sync_channel},
     },
@@ -13,7 +14,7 @@ use actix::{Actor, ActorContext, AsyncContext, Handler, Running, StreamHandler, 
 use sinew_runtime::{
     app::{AppContext, AppSpec, Delivery},
     outcome::Outcome,
-    supervision::{Place, Reason},
+    supervision::{ActorRestart, Place, Reason, RestartObserver, observe_restarts},
     wire::Class,
 };
 
@@ -263,6 +264,37 @@ fn panic_payload_with_endless_drop_is_dropped_elsewhere() {
     assert_eq!(read.recv_timeout(DEADLINE).expect("the successor works"), "2: 1");
     assert_eq!(stage.most_abandoned(), 0);
     assert_eq!(stage.stop(), Reason::Shutdown);
+}
+
+#[derive(Default)]
+struct Restarts(Mutex<Vec<(u64, String)>>);
+
+impl RestartObserver for Restarts {
+    fn restarted(&self, restart: &ActorRestart<'_>) {
+        // Other tests of this process restart actors, too.
+        if restart.name == "fragile and observed" {
+            assert_eq!(restart.supervisor, "test");
+            self.0.lock().unwrap().push((restart.restarts, restart.why.to_owned()));
+        }
+    }
+}
+
+#[test]
+fn restart_is_shown_with_the_last_end() {
+    let restarts = Arc::new(Restarts::default());
+    let observer: Arc<dyn RestartObserver> = restarts.clone();
+    assert!(observe_restarts(&observer));
+    let (spec, _read) = fragile("fragile and observed", Where::Handler);
+    let stage = Stage::start(vec![spec.own_thread().into()]);
+    stage.wait_ready(0);
+    assert!(restarts.0.lock().unwrap().is_empty(), "the first start is no restart");
+    stage.send(0, 13);
+    stage.wait_failed(0);
+    stage.wait_ready(0);
+    stage.stop();
+    let shown = restarts.0.lock().unwrap();
+    let [(1, why)] = &shown[..] else { panic!("not one restart: {shown:?}") };
+    assert!(why.starts_with("panicked: in the handler at "), "{why}");
 }
 
 #[test]

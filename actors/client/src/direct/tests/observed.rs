@@ -4,6 +4,7 @@ use std::sync::Arc;
 
 use sinew_runtime::{
     lock,
+    outcome::{self, Outcome, OutcomeObserver, Ticket},
     router::tap::{Passage, Tap, TapOf, Way},
     tid::Tid,
     wire::{Header, Kind},
@@ -86,6 +87,49 @@ fn watched_endpoint_reports_messages_on_its_links() {
     }
     // Then: nothing more is shown
     assert_eq!(lock(&notes.seen).len(), seen);
+}
+
+/// The outcomes of the messages of one application.
+struct Outcomes {
+    source: Tid,
+    seen: std::sync::Mutex<Vec<(Tid, Outcome)>>,
+}
+
+impl OutcomeObserver for Outcomes {
+    fn settled(&self, ticket: Ticket, outcome: Outcome) {
+        if ticket.source == self.source {
+            lock(&self.seen).push((ticket.destination, outcome));
+        }
+    }
+}
+
+#[test]
+fn observed_endpoint_reports_outcomes_on_its_links() {
+    let node = TestNode::start();
+    let (mut one, mut other) = (endpoint(&node), endpoint(&node));
+    link(&mut one, &mut other);
+    let notes = Arc::new(Notes { app: one.tid(), seen: std::sync::Mutex::default() });
+    node.router().set_tap(TapOf::Recording, Some(notes.clone()));
+    node.state.observed_links.observe(node.router());
+    let outcomes = Arc::new(Outcomes { source: one.tid(), seen: std::sync::Mutex::default() });
+    let observer: Arc<dyn OutcomeObserver> = outcomes.clone();
+    assert!(outcome::observe(&observer, None));
+    let deadline = Time::now() + WATCHDOG;
+    while !one.direct.is_observed() {
+        assert!(Time::now() < deadline, "waited for the order to report");
+        exchange(&mut one, &mut other, 1);
+    }
+    thread::scope(|scope| {
+        let (from, to) = (&mut one, other.tid());
+        let sending = scope.spawn(move || from.message(to, &Counted(2)).confirmed(WATCHDOG).unwrap());
+        other.receive(WATCHDOG).unwrap().expect("a message").settle(Outcome::Failed);
+        assert_eq!(sending.join().unwrap(), Outcome::Failed);
+    });
+    // Applications of other tests have the same addresses.
+    while !lock(&outcomes.seen).contains(&(other.tid(), Outcome::Failed)) {
+        assert!(Time::now() < deadline, "waited for the report of the outcome");
+        thread::yield_now();
+    }
 }
 
 // spec: LNCL-20

@@ -46,7 +46,8 @@ fn kept(outputs: &[Output]) -> BTreeMap<TriggerId, (u64, u64)> {
 
 fn order(trigger: &Trigger, replaces: &[TriggerId]) -> SpanOrder {
     let (begin_ns, end_ns) = (trigger.begin_ns(), trigger.end_ns());
-    SpanOrder { trigger: trigger.clone(), begin_ns, end_ns, replaces: replaces.to_vec() }
+    let causes = trigger.cause.as_str().to_owned();
+    SpanOrder { trigger: trigger.clone(), causes, begin_ns, end_ns, replaces: replaces.to_vec() }
 }
 
 #[test]
@@ -73,6 +74,37 @@ fn flood_of_causes_has_one_trigger_per_span() {
 }
 
 #[test]
+fn name_of_a_span_has_its_causes_in_order() {
+    let mut plan = plan(1);
+    plan.happened(100 * SECOND, 100 * SECOND, "a guard is shut").unwrap();
+    // Given: causes that make no trigger, one of them reported late, and one twice
+    for (at_ns, cause) in [(102, "the knee is lost"), (101, "late"), (101, "a guard is shut"), (102, "late")]
+    {
+        plan.happened(102 * SECOND, at_ns * SECOND, cause).unwrap();
+    }
+    assert!(plan.received(103 * SECOND, trigger(2, 1, 101 * SECOND + 1)));
+    let name = |plan: &mut FreezePlan| {
+        let mut orders = drain(plan, 110 * SECOND).into_iter().filter_map(|output| match output {
+            Output::Freeze(order) => Some(order.causes),
+            Output::Forward(_) => None,
+        });
+        orders.next().expect("it is due")
+    };
+    assert_eq!(name(&mut plan), "a guard is shut; late; test; the knee is lost");
+    // And: a long list is counted
+    let at_ns = 200 * SECOND;
+    for number in 0..100 {
+        plan.happened(at_ns, at_ns + number, &format!("fault {number}")).unwrap();
+    }
+    assert_eq!(plan.covered.len(), COVERED_MAX);
+    let later = plan.poll(at_ns).is_some().then(|| drain(&mut plan, at_ns + 10 * SECOND)).unwrap();
+    let Some(Output::Freeze(order)) = later.last() else { panic!("it is due: {later:?}") };
+    assert!(
+        order.causes.starts_with("fault 0; fault 1; ") && order.causes.ends_with("; fault 7; and 92 more")
+    );
+}
+
+#[test]
 fn trigger_with_a_smaller_id_replaces_a_frozen_span() {
     let mut plan = plan(2);
     let id = plan.happened(100 * SECOND, 100 * SECOND, "late").unwrap();
@@ -80,7 +112,7 @@ fn trigger_with_a_smaller_id_replaces_a_frozen_span() {
     assert_eq!(kept(&drain(&mut plan, 103 * SECOND)), BTreeMap::from([(id, span)]));
     let other = trigger(1, 1, 101 * SECOND);
     assert!(plan.received(104 * SECOND, other.clone()) && !plan.received(104 * SECOND, other.clone()));
-    let both = SpanOrder { begin_ns: span.0, ..order(&other, &[id]) };
+    let both = SpanOrder { begin_ns: span.0, causes: "late; test".to_owned(), ..order(&other, &[id]) };
     assert_eq!(drain(&mut plan, 104 * SECOND), [Output::Forward(other), Output::Freeze(both)]);
     assert_eq!(plan.poll(105 * SECOND), None);
 }

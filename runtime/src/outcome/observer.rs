@@ -1,0 +1,86 @@
+//! Observers of the outcomes of confirmed messages, while there are any: nodes that record.
+//!
+//! The sink of a receipt shows the outcome where the sender gets it. Receipts of copies and of quotas do not, so each
+//! message is shown once.
+
+use std::sync::Arc;
+
+use super::{MemberReport, MemberState, Outcome, Ticket};
+use crate::observers::Observers;
+
+/// An observer of outcomes. It is called on the thread that settles the message, which may be a real-time thread, so it
+/// must not wait.
+pub trait OutcomeObserver: Send + Sync {
+    /// Receives the outcome of the message of `ticket`. For one member of a message to many, the ticket has the member
+    /// as its destination, or the address of its node where that has one outcome for all of its members.
+    fn settled(&self, ticket: Ticket, outcome: Outcome);
+}
+
+static OBSERVERS: Observers<dyn OutcomeObserver> = Observers::new();
+
+/// Adds an observer for as long as it lives, in place of `former`. Each outcome reaches one of the two. Returns `false`
+/// if there are too many.
+pub fn observe(observer: &Arc<dyn OutcomeObserver>, former: Option<&Arc<dyn OutcomeObserver>>) -> bool {
+    OBSERVERS.add(observer, former)
+}
+
+/// Shows the outcome of a message to all observers. Without any observer it costs one load.
+#[inline]
+pub fn show(ticket: Ticket, outcome: Outcome) {
+    OBSERVERS.each(|observer| observer.settled(ticket, outcome));
+}
+
+/// Shows the outcomes of members of a message to many to all observers.
+pub fn show_members(ticket: Ticket, reports: &[MemberReport]) {
+    OBSERVERS.each(|observer| {
+        for MemberReport { tid, state } in reports {
+            if let MemberState::Settled(outcome) = *state {
+                observer.settled(Ticket { destination: *tid, ..ticket }, outcome);
+            }
+        }
+    });
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Mutex;
+
+    use super::*;
+    use crate::{
+        lock,
+        outcome::{ReceiptSink, Rejection},
+        pending::{Awaited, Pending},
+        tid::{AppAddress, NodeAddress, Tid},
+    };
+
+    /// A source that no other test has: all tests of this process share the observers.
+    const SOURCE: Tid = Tid::new(NodeAddress::new(0x7f00_0063), AppAddress::new(0x1063));
+
+    #[derive(Default)]
+    struct Notes(Mutex<Vec<(Tid, Outcome)>>);
+
+    impl OutcomeObserver for Notes {
+        fn settled(&self, ticket: Ticket, outcome: Outcome) {
+            if ticket.source == SOURCE {
+                lock(&self.0).push((ticket.destination, outcome));
+            }
+        }
+    }
+
+    #[test]
+    fn outcomes_of_a_message_and_its_members_are_shown() {
+        let notes = Arc::new(Notes::default());
+        let observer: Arc<dyn OutcomeObserver> = notes.clone();
+        assert!(observe(&observer, None));
+        let pending = Pending::new(1);
+        let drives = Tid::group("drives");
+        let wait = pending.open(Awaited::Outcome, drives).expect("it has room");
+        let ticket = Ticket { source: SOURCE, destination: drives, correlation: wait.correlation() };
+        let member = Tid::new(NodeAddress::new(0x7f00_0063), AppAddress::new(0x1064));
+        let full = Outcome::Rejected(Rejection::QueueFull);
+        pending.members(ticket, &[MemberReport::of_member(member, MemberState::Pending)]);
+        pending.members(ticket, &[MemberReport::of_member(member, MemberState::Settled(full))]);
+        pending.settle(ticket, Outcome::Delivered);
+        assert_eq!(*lock(&notes.0), [(member, full), (drives, Outcome::Delivered)]);
+    }
+}
