@@ -245,7 +245,7 @@ fn joined_copy_has_the_lost_records_of_former_ones() {
 
 #[test]
 fn longest_record_has_room_in_a_copy() {
-    let folder = Folder::new("long");
+    let folder = Folder::new("longest");
     let target = folder.0.join("knee.frozen");
     let options = Options { ring_bytes: 1 << 20, ..small() };
     let journal = Journal::create(&folder.path(), &options).unwrap();
