@@ -343,7 +343,7 @@ mod tests {
     }
 
     #[test]
-    fn retained_type_is_kept_in_groups_alone_and_in_its_own_class() {
+    fn retained_type_is_kept_in_its_class_and_groups() {
         let group = Tid::group("modes");
         let mut to_group = Message::typed(Tid::NONE, group, &Mode(1)).header;
         let mut to_one = Message::typed(Tid::NONE, Tid::from_bits(0x1_0000_1000), &Mode(1)).header;
@@ -355,7 +355,7 @@ mod tests {
     }
 
     #[test]
-    fn removal_of_a_retained_value_is_empty_and_does_not_expire() {
+    fn removal_of_retained_value_is_empty_without_expiry() {
         let Message { header, payload, .. } =
             Message::clear_retained::<Mode>(Tid::NONE, AppAddress::group("modes"));
         assert_eq!((header.destination, header.flags), (Tid::group("modes"), Flags::KEEP));

@@ -66,7 +66,7 @@ impl Scene {
 }
 
 #[test]
-fn late_member_of_another_node_gets_the_newest_value_once_and_before_newer_ones() {
+fn late_member_elsewhere_gets_newest_value_once_and_first() {
     // Given: a value that was sent before the first member joined
     let scene = Scene::new();
     let [hip, knee] = &scene.sockets;
@@ -101,7 +101,7 @@ fn late_member_of_another_node_gets_the_newest_value_once_and_before_newer_ones(
 }
 
 #[test]
-fn late_member_gets_no_value_that_was_cleared_or_of_an_ended_sender() {
+fn late_member_gets_no_cleared_or_ended_value() {
     for ends in [false, true] {
         // Given: a member on the other node that has a value
         let scene = Scene::new();
@@ -165,7 +165,7 @@ impl Handler<Delivery<Mode>> for Listener {
 }
 
 #[test]
-fn node_that_starts_later_gets_the_value_of_an_actor() {
+fn later_node_gets_the_value_of_an_actor() {
     let loopback = Loopback::new();
     let hip = loopback.node("hip").app(AppSpec::new("announcer", || Announcer)).start().expect("a node");
     all_run(&[&hip]);

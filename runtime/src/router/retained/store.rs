@@ -259,7 +259,7 @@ mod tests {
     }
 
     #[test]
-    fn value_beyond_each_bound_is_refused_and_the_former_stays() {
+    fn value_beyond_bound_is_refused_and_former_stays() {
         let mut store = Store::default();
         for app in 0..256 {
             assert_eq!(store.keep(OWN, Time::ZERO, &value(app, 10, 1)), Ok(()));
@@ -323,7 +323,7 @@ mod tests {
     }
 
     #[test]
-    fn value_is_handed_over_without_a_receipt_and_with_its_time() {
+    fn value_has_no_receipt_and_keeps_its_time() {
         let mut store = Store::default();
         let mut message = value(1, 10, 5);
         message.header.flags = Flags::KEEP.with(Flags::CONFIRM);

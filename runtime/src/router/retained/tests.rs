@@ -126,7 +126,7 @@ impl Nodes {
 }
 
 #[test]
-fn late_member_of_the_same_node_gets_the_newest_value_once() {
+fn late_member_here_gets_the_newest_value_once() {
     let mut nodes = Nodes::new();
     nodes.send();
     let newest = nodes.send();
@@ -152,7 +152,7 @@ fn sender_that_joins_gets_no_value_of_its_own() {
 }
 
 #[test]
-fn late_member_of_another_node_gets_the_newest_value_once() {
+fn late_member_elsewhere_gets_the_newest_value_once() {
     let mut nodes = Nodes::new();
     nodes.send();
     let newest = nodes.send();
@@ -183,7 +183,7 @@ fn value_has_its_send_time() {
 }
 
 #[test]
-fn member_that_left_and_joined_again_gets_the_present_value() {
+fn member_that_joins_again_gets_the_present_value() {
     let mut nodes = Nodes::new();
     let _first = nodes.join(1);
     nodes.publish();
@@ -213,7 +213,7 @@ fn member_that_left_and_joined_again_gets_the_present_value() {
 }
 
 #[test]
-fn value_of_an_ended_or_clearing_sender_is_not_handed_over() {
+fn value_of_ended_or_clearing_sender_is_gone() {
     for ends in [true, false] {
         let mut nodes = Nodes::new();
         let first = nodes.join(1);
@@ -234,7 +234,7 @@ fn value_of_an_ended_or_clearing_sender_is_not_handed_over() {
 }
 
 #[test]
-fn values_of_a_lost_node_are_removed_and_come_again_with_its_link() {
+fn values_of_lost_node_return_with_its_link() {
     let mut nodes = Nodes::new();
     let first = nodes.join(1);
     nodes.publish();
@@ -255,7 +255,7 @@ fn values_of_a_lost_node_are_removed_and_come_again_with_its_link() {
 }
 
 #[test]
-fn value_or_removal_without_room_is_sent_with_a_later_list() {
+fn value_without_room_follows_a_later_list() {
     let mut nodes = Nodes::new();
     let value = nodes.send();
     let member = nodes.join(1);
@@ -274,7 +274,7 @@ fn value_or_removal_without_room_is_sent_with_a_later_list() {
 }
 
 #[test]
-fn value_that_a_node_had_no_room_for_replaces_its_former_one_there() {
+fn value_without_room_replaces_the_former_one_later() {
     let mut nodes = Nodes::new();
     let member = nodes.join(1);
     nodes.publish();
@@ -292,7 +292,7 @@ fn value_that_a_node_had_no_room_for_replaces_its_former_one_there() {
 }
 
 #[test]
-fn value_that_is_too_long_for_a_node_leaves_no_former_one_there() {
+fn value_too_long_there_leaves_no_former_one() {
     let mut nodes = Nodes::new();
     let member = nodes.join(1);
     nodes.publish();
@@ -307,7 +307,7 @@ fn value_that_is_too_long_for_a_node_leaves_no_former_one_there() {
 }
 
 #[test]
-fn next_incarnation_of_a_member_gets_the_value_when_it_joins_again() {
+fn next_incarnation_of_member_gets_the_value_again() {
     let mut nodes = Nodes::new();
     let value = nodes.send();
     let (app, sink) = Nodes::member(&nodes.sending, 1);
@@ -327,7 +327,7 @@ fn next_incarnation_of_a_member_gets_the_value_when_it_joins_again() {
 }
 
 #[test]
-fn removal_reaches_a_node_that_does_not_list_the_group() {
+fn removal_reaches_node_without_the_group() {
     let mut nodes = Nodes::new();
     let _first = nodes.join(1);
     nodes.publish();
@@ -344,7 +344,7 @@ fn removal_reaches_a_node_that_does_not_list_the_group() {
 }
 
 #[test]
-fn late_message_of_an_ended_sender_or_lost_node_is_not_retained() {
+fn late_message_of_lost_sender_is_not_retained() {
     let mut nodes = Nodes::new();
     let member = nodes.join(1);
     nodes.publish();
@@ -372,7 +372,7 @@ fn full_member_misses_its_value_and_this_is_counted() {
 }
 
 #[test]
-fn value_beyond_a_bound_is_delivered_and_its_predecessor_removed() {
+fn value_beyond_bound_is_delivered_and_predecessor_removed() {
     let mut nodes = Nodes::new();
     let first = nodes.join(1);
     nodes.publish();
@@ -420,7 +420,7 @@ fn check(seed: u64, seen: &[Seen], newest: Option<u64>) {
 }
 
 #[test]
-fn no_order_of_sends_joins_and_lists_delivers_an_older_value_or_one_twice() {
+fn no_order_delivers_an_older_value_or_one_twice() {
     for seed in 0..500 {
         let (mut random, mut nodes) = (fastrand::Rng::with_seed(seed), Nodes::new());
         let mut members: Vec<(Arc<Sink>, Vec<Seen>)> = Vec::new();
@@ -446,7 +446,7 @@ fn no_order_of_sends_joins_and_lists_delivers_an_older_value_or_one_twice() {
 }
 
 #[test]
-fn member_that_joins_beside_a_sending_thread_gets_each_value_once_in_order() {
+fn member_joining_beside_sends_gets_values_in_order() {
     for seed in 0..50 {
         let router = Arc::new(Router::new(SENDING));
         Nodes::register(&router, SENDER);
