@@ -29,7 +29,7 @@ pub use frozen::{
     FrozenPart, FrozenReport, FrozenSpan,
 };
 pub use question::{
-    AskRecord, CLOCKS_MAX, RECORDED_MAX, RecordReport, RecordedApp, RecordedType, SCHEMAS_MAX,
+    AskRecord, CLOCKS_MAX, RECORDED_MAX, RecordCounts, RecordReport, RecordedApp, RecordedType, SCHEMAS_MAX,
 };
 pub use selection::{Chosen, Selection, SelectionError};
 pub use tap::{RecordTap, lost_channel};

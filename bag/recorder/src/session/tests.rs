@@ -243,6 +243,8 @@ fn messages_beyond_the_maximum_size_are_counted() {
     let Totals { seen, written, dropped, .. } = summary.totals;
     assert!(seen == 2_000 && written > 0 && dropped > 0 && seen == written + dropped, "{summary:?}");
     assert!(summary.is_whole(), "its limit is no fault: {summary:?}");
+    let last = lock(&node.asked).last().and_then(|question| question.counts);
+    assert_eq!(last, Some(RecordCounts { seen, dropped }), "the node reports them");
 }
 
 #[test]
