@@ -7,7 +7,7 @@ use clap::{CommandFactory as _, FromArgMatches as _, Parser, Subcommand};
 use crate::{bag, keys, param, play, record, send, view, watch, why};
 
 /// Shows a running Sinew system, from any one node of it. It changes nothing, except that `send` and `play` send
-/// messages, `param` sets parameters, and `keys`, `record` and `bag` write files.
+/// messages, `param` and the page of `view` set parameters, and `keys`, `record` and `bag` write files.
 ///
 /// It connects to the socket of a node on this machine (`lncl.socket` in the node's configuration) and asks
 /// that node, and through it all others.
@@ -121,13 +121,15 @@ pub(crate) enum Command {
   sinew play --check walk.mcap -- target/release/knee knee.toml
   sinew play --check walk.mcap --app knee.drive --ignore t_ns --start-before 1ms -- target/release/knee knee.toml"#)]
     Play(play::Order),
-    /// Serves the state of all nodes as metrics for Prometheus, until Ctrl-C
+    /// Serves the state of all nodes as a page, and as metrics for Prometheus, until Ctrl-C
     ///
-    /// GET /metrics has the metrics, GET / a list of the nodes. All nodes are asked at most once a second, and only
-    /// while requests come. A node that does not answer is a metric. Requests for other hosts than localhost and the
-    /// address of --listen are refused. Dashboard and alert rules: view/grafana.json and view/alerts.yml of the source.
+    /// The command prints the address of the page, with the token of this start: it shows nodes, links, applications
+    /// and messages, and sets parameters with the rights that the nodes give to this command. GET /metrics has the
+    /// metrics, without a token. All nodes are asked at most three times a second, and only while requests come or a
+    /// page is open. Requests for other hosts than localhost and the address of --listen are refused. Dashboard and
+    /// alert rules: view/grafana.json and view/alerts.yml of the source.
     #[command(after_help = r#"Examples:
-  sinew view
+  sinew view                                  prints the address of the page
   curl http://127.0.0.1:9464/metrics
   sinew view --listen 192.168.0.10:9464       for a Prometheus server on another machine; there is no encryption"#)]
     View(view::Order),

@@ -21,6 +21,7 @@ use crate::{
     table::clean,
 };
 use assignment::{Assignment, ParameterName};
+use sinew_view::AppParameters;
 
 /// The commands of `sinew param`.
 #[derive(Debug, Subcommand)]
@@ -195,8 +196,31 @@ fn send(system: &mut System, app: &str, to: Tid, set: &SetParameters) -> Result<
     sent.map_err(|error| words(&error, app, true))
 }
 
+/// Sets parameters for the page of `sinew view`.
+///
+/// # Errors
+/// Why there is no outcome, with the remedy.
+pub(crate) fn set(system: &mut System, app: &str, set: &SetParameters) -> Result<ParameterOutcome, String> {
+    SetResult::of(system, app, set).map_err(|why| why.to_string())?.outcome
+}
+
+/// Returns the parameters of each application that has some, for the page of `sinew view`.
+///
+/// # Errors
+/// The entry node does not answer.
+pub(crate) fn all(system: &mut System) -> Result<Vec<AppParameters>, SystemError> {
+    let (listed, silent) = list::all(system)?;
+    let mut all: Vec<_> =
+        listed.into_iter().map(|one| AppParameters { app: one.app, result: one.result }).collect();
+    all.extend(silent.into_iter().map(|node| AppParameters {
+        app: node,
+        result: Err("its node did not list its applications".to_owned()),
+    }));
+    Ok(all)
+}
+
 /// Registers at the socket of this node, if this host has it.
-fn enter_node(system: &mut System, node: NodeAddress) -> Option<System> {
+pub(crate) fn enter_node(system: &mut System, node: NodeAddress) -> Option<System> {
     // A node of another robot on this host may have the same address.
     let incarnation = system.here().ok()?.peers.iter().find(|peer| peer.node == node)?.incarnation;
     let (others, _) = System::beside(system, &[]);

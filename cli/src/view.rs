@@ -1,26 +1,38 @@
-//! `sinew view`: serves the state of all nodes as metrics.
+//! `sinew view`: serves the state of all nodes as a page and as metrics.
 //!
 //! Each snapshot has endpoints of its own: one that stayed would leave unread each broadcast between two snapshots, and
 //! its node would report a client that does not read. They are dropped without a wait for the node, which may have died
-//! meanwhile.
+//! meanwhile. So have the questions about parameters and the readers of messages.
 
-use std::{collections::BTreeSet, net::SocketAddr, time::Duration};
+mod messages;
+mod questions;
+
+use std::{
+    collections::{BTreeMap, BTreeSet},
+    net::SocketAddr,
+    path::PathBuf,
+    sync::{Arc, Mutex, MutexGuard, PoisonError},
+    time::Duration,
+};
 
 use clap::Args;
 use serde_json::json;
 use sinew::{
-    Endpoint, NodeAddress, NodeApi, Payload, Tid, Time,
-    inspect::{AskApps, AskAudit, AskNode, AskTree, AuditReport, NodeReport},
+    Endpoint, NodeAddress, NodeApi, Tid, Time,
+    inspect::{AskNode, NodeReport},
+    parameters::{ParameterOutcome, SetParameters},
 };
-use sinew_view::{Answers, NODES_MAX, NodeAnswers, Server, Snapshot, Source};
+use sinew_view::{AppParameters, NODES_MAX, NodeAnswers, Server, Snapshot, Source, Tap};
 
 use crate::{
     Report,
     arguments::Arguments,
-    output, sockets,
-    system::{REQUESTERS_MAX, SystemError, ask, present, register},
+    output, param, sockets,
+    system::{REQUESTERS_MAX, System, SystemError, present, register},
     table::clean,
 };
+use messages::Messages;
+use questions::Questions;
 
 /// Time limit for a snapshot, below that of a request.
 const SNAPSHOT_WITHIN: Duration = Duration::from_secs(4);
@@ -34,11 +46,11 @@ pub(crate) struct Order {
     listen: SocketAddr,
 }
 
-/// Serves metrics until the user ends it.
+/// Serves the page and the metrics until the user ends it.
 pub(crate) fn show(order: &Order, arguments: &Arguments) -> Result<Report, SystemError> {
-    let (path, api) = sockets::find(arguments.socket.as_deref())?;
-    let path = path.display().to_string();
-    let mut nodes = Nodes { api, within: arguments.within() };
+    let (socket, api) = sockets::find(arguments.socket.as_deref())?;
+    let path = socket.display().to_string();
+    let nodes = Nodes { api, within: arguments.within(), entry: Arc::new(Entry::new(socket)) };
     // As with other commands, a node that refuses or is silent at the start is an error.
     if let Err(why) = nodes.snapshot().entry {
         return Err(SystemError::NoAnswer(path, why));
@@ -50,15 +62,16 @@ pub(crate) fn show(order: &Order, arguments: &Arguments) -> Result<Report, Syste
     let address = server.address();
     if !address.ip().is_loopback() {
         output::note(format_args!(
-            "sinew: warning: {address} is not loopback: every program that reaches it can read the state of all nodes, without encryption"
+            "sinew: warning: {address} is not loopback: every program that reaches it can read the metrics of all nodes, and the page and its token travel without encryption"
         ));
     }
     let announcement = if arguments.json {
-        json!({ "listens": address.to_string(), "through": path }).to_string()
+        json!({ "listens": address.to_string(), "through": path, "page": server.page() }).to_string()
     } else {
         format!(
-            "http://{address}/metrics has the metrics of all nodes, through {}; Ctrl-C ends it",
-            clean(&path)
+            "http://{address}/metrics has the metrics of all nodes, through {}; Ctrl-C ends it\n{} is the page, for its bearer alone",
+            clean(&path),
+            server.page()
         )
     };
     output::line(&announcement);
@@ -74,15 +87,98 @@ struct Nodes {
     api: NodeApi,
     /// Time limit for each answer.
     within: Duration,
+    entry: Arc<Entry>,
+}
+
+/// The names of applications.
+type Names = BTreeMap<Tid, String>;
+
+/// The entry node, and the knowledge that the parts of this program share.
+struct Entry {
+    socket: PathBuf,
+    /// The addresses of this program, which are no part of the system, except those of the present snapshot.
+    own: Mutex<BTreeSet<Tid>>,
+    /// The names of all applications in the latest snapshot.
+    names: Mutex<Arc<Names>>,
+}
+
+impl Entry {
+    fn new(socket: PathBuf) -> Self {
+        Self { socket, own: Mutex::default(), names: Mutex::default() }
+    }
+
+    fn own(&self) -> MutexGuard<'_, BTreeSet<Tid>> {
+        self.own.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn names(&self) -> Arc<Names> {
+        Arc::clone(&self.names.lock().unwrap_or_else(PoisonError::into_inner))
+    }
+
+    fn set_names(&self, names: Names) {
+        *self.names.lock().unwrap_or_else(PoisonError::into_inner) = Arc::new(names);
+    }
+
+    /// Registers at the entry node.
+    fn enter(&self, within: Duration) -> Result<System, String> {
+        let system = System::enter(Some(self.socket.as_path()), within).map_err(|why| why.to_string())?;
+        self.add(&system);
+        Ok(system)
+    }
+
+    fn add(&self, system: &System) {
+        self.own().extend(&system.own);
+    }
+
+    fn leave(&self, system: System) {
+        let own = system.own.clone();
+        system.leave();
+        self.own().retain(|tid| !own.contains(tid));
+    }
 }
 
 impl Source for Nodes {
-    fn snapshot(&mut self) -> Snapshot {
+    fn snapshot(&self) -> Snapshot {
         let taken = Time::now();
         let until = taken + SNAPSHOT_WITHIN;
         let questions = Questions { within: self.within, until };
-        self.ask_all(questions, taken).unwrap_or_else(|why| Snapshot::without_entry(taken, why))
+        let mut snapshot =
+            self.ask_all(questions, taken).unwrap_or_else(|why| Snapshot::without_entry(taken, why));
+        snapshot.own.extend(self.entry.own().iter());
+        self.entry.set_names(names(&snapshot));
+        snapshot
     }
+
+    fn parameters(&self) -> Result<Vec<AppParameters>, String> {
+        let mut system = self.entry.enter(self.within)?;
+        let all = param::all(&mut system);
+        self.entry.leave(system);
+        all.map_err(|why| why.to_string())
+    }
+
+    fn set(&self, app: &str, set: &SetParameters) -> Result<ParameterOutcome, String> {
+        let mut system = self.entry.enter(self.within)?;
+        let outcome = param::set(&mut system, app, set);
+        self.entry.leave(system);
+        let end = match &outcome {
+            Ok(ParameterOutcome::Applied { tick, .. }) => format!("applied at tick {tick}"),
+            Ok(ParameterOutcome::Refused { why }) => format!("refused: {why}"),
+            Err(why) => why.clone(),
+        };
+        output::note(format_args!("sinew: the page set {}: {}", clean(app), clean(&end)));
+        outcome
+    }
+
+    fn tap(&self) -> Box<dyn Tap> {
+        Box::new(Messages::new(Arc::clone(&self.entry), self.within))
+    }
+}
+
+/// Returns the names of all applications.
+fn names(snapshot: &Snapshot) -> Names {
+    let answers = snapshot.nodes.iter().filter_map(|node| node.result.as_ref().ok());
+    let apps = answers.flat_map(|answers| &answers.apps.apps);
+    apps.filter_map(|app| Some((app.tid, app.name.clone()?))).collect()
 }
 
 impl Nodes {
@@ -129,58 +225,5 @@ impl Nodes {
         });
         answers.sort_by_key(|answer| answer.node);
         (own, answers)
-    }
-}
-
-/// The time limits of the questions of one snapshot.
-#[derive(Clone, Copy)]
-struct Questions {
-    within: Duration,
-    until: Time,
-}
-
-impl Questions {
-    /// Returns the time limit for the next answer, if there is time left.
-    fn left(self) -> Result<Duration, String> {
-        let left = self.until.since(Time::now()).min(self.within);
-        if left.is_zero() {
-            return Err(format!("not asked: other answers have taken all of {SNAPSHOT_WITHIN:?}"));
-        }
-        Ok(left)
-    }
-
-    fn ask<Q: Payload + Default, R: Payload>(
-        self,
-        endpoint: &mut Endpoint,
-        node: NodeAddress,
-    ) -> Result<R, String> {
-        ask::<Q, R>(endpoint, node, self.left()?)
-    }
-
-    /// Asks a node all questions, or up to the first one without an answer.
-    fn ask_node(
-        self,
-        endpoint: &mut Endpoint,
-        here: &NodeReport,
-        (node, name): &(NodeAddress, String),
-    ) -> NodeAnswers {
-        let result = self.answers(endpoint, here, *node);
-        NodeAnswers { node: *node, name: name.clone(), result: result.map(Box::new) }
-    }
-
-    fn answers(
-        self,
-        endpoint: &mut Endpoint,
-        here: &NodeReport,
-        node: NodeAddress,
-    ) -> Result<Answers, String> {
-        let report =
-            if node == here.node { here.clone() } else { self.ask::<AskNode, NodeReport>(endpoint, node)? };
-        Ok(Answers {
-            node: report,
-            apps: self.ask::<AskApps, _>(endpoint, node)?,
-            tree: self.ask::<AskTree, _>(endpoint, node)?,
-            audit: self.ask::<AskAudit, AuditReport>(endpoint, node)?.audit,
-        })
     }
 }

@@ -1,27 +1,51 @@
-//! `sinew view`: the state of a running system for other programs, as metrics for Prometheus over HTTP.
+//! `sinew view`: the state of a running system as a page for people, and as metrics for Prometheus, over HTTP.
 //!
-//! It knows no node. A [`Source`], which the command `sinew` has, asks the nodes for a [`Snapshot`]. The [`Server`]
-//! asks it at most once a second, however many requests there are, and answers `GET /metrics` and `GET /`.
+//! It knows no node. A [`Source`], which the command `sinew` has, asks the nodes for a [`Snapshot`], sets parameters
+//! and reads messages. The [`Server`] asks it at most three times a second, however many requests there are.
+//!
+//! ```text
+//! browser ── GET /api/stream ──► stream: state, log ◄── cache ◄── thread `snapshots` ──► Source::snapshot
+//!                                   ▲ points, tables ◄── pages ◄── thread `messages` ──► Tap::poll
+//!         ── POST /api/parameters ──► answer ──► Source::set
+//! ```
 //!
 //! | module | content |
 //! | --- | --- |
 //! | `snapshot` | the answers of all nodes at one moment |
+//! | `source` | the system as this package sees it: snapshots, parameters, messages |
 //! | `nodes` | the state of each node and its label, for the metrics and the page |
 //! | `metrics` | the table of all metrics, and their samples from a snapshot |
-//! | `page` | the page at `/` |
-//! | `request` | which request is refused, and why |
+//! | `model` | the state of the system as JSON |
+//! | `events` | the log of events: the differences of snapshots |
+//! | `look`, `scope` | the messages at which one page looks |
+//! | `fields`, `decimate` | the numbers of a payload, and series with few points |
+//! | `pages`, `stream` | the open pages, and the stream of each |
+//! | `assets` | the files of the page |
+//! | `auth`, `request` | the token, and which request is refused, and why |
 //! | `cache` | the thread that asks, and the latest snapshot |
-//! | `server` | connections and their limits |
+//! | `answer`, `body`, `server` | answers, connections and their limits |
 
+mod answer;
+mod assets;
+mod auth;
+mod body;
 mod cache;
+mod decimate;
+mod events;
+mod fields;
+mod look;
 mod metrics;
+mod model;
 mod nodes;
-mod page;
+mod pages;
 mod request;
+mod scope;
 mod server;
 mod snapshot;
+mod source;
+mod stream;
 
-pub use cache::Source;
 pub use metrics::{METRICS, Metric, Shape};
 pub use server::Server;
 pub use snapshot::{Answers, NODES_MAX, NodeAnswers, Snapshot};
+pub use source::{AppParameters, NoSystem, Sighting, Source, Tap};

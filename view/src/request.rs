@@ -1,15 +1,24 @@
-//! Checks requests. Any website can make a browser send requests to this host, by a name that it points here. So only
-//! a request with a `Host` of this host is answered.
+//! Checks requests. Any website can make a browser send requests to this host, by a name that it points here, or with
+//! an address of this host. So only a request with a `Host` of this host is answered. All but the metrics need the
+//! token, and one that writes or opens a stream has to come from the page itself.
 
 use std::net::IpAddr;
 
 use hyper::{
     HeaderMap, Method, StatusCode, Uri,
-    header::{ACCEPT, HOST},
+    header::{ACCEPT, CONTENT_TYPE, HOST, ORIGIN},
     http::uri::Authority,
 };
 
-use crate::metrics::Format;
+use crate::{
+    assets::{self, Asset},
+    auth::Token,
+    look::Look,
+    metrics::Format,
+};
+
+/// The site that sent a request, as browsers state it.
+const FETCH_SITE: &str = "sec-fetch-site";
 
 /// The first part of a request.
 #[derive(Clone, Copy, Debug)]
@@ -20,11 +29,31 @@ pub(crate) struct Head<'r> {
     pub(crate) has_body: bool,
 }
 
-/// The requested document.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+/// The server's own part of the checks.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Access<'s> {
+    /// The address that it listens on.
+    pub(crate) listens: IpAddr,
+    pub(crate) token: &'s Token,
+    /// The name of the cookie with the token.
+    pub(crate) cookie: &'s str,
+}
+
+/// The requested document or act.
+#[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) enum Document {
+    /// The metrics, which need no token.
     Metrics(Format),
-    Page,
+    /// The page with a valid token in its address: the browser gets it as a cookie.
+    Login,
+    /// A file of the page.
+    File(&'static Asset),
+    /// The stream of a page.
+    Stream(Look),
+    /// The parameters of all applications.
+    Parameters,
+    /// A set of parameters: the body has it.
+    Set,
 }
 
 /// Why a request is refused.
@@ -36,12 +65,24 @@ pub(crate) enum RequestError {
     /// It is meant for another host.
     #[error("the request is for another host; use localhost or the address that sinew view listens on")]
     OtherHost,
-    /// It would change something.
-    #[error("only GET is answered")]
-    Method,
+    /// It has not the token.
+    #[error("the page needs the token of this start; open the address that sinew view has printed")]
+    NoToken,
+    /// Another site has sent it.
+    #[error("the request comes from another site; use the page of sinew view itself")]
+    OtherSite,
+    /// The path has another method.
+    #[error("only {0} is answered here")]
+    Method(&'static str),
     /// It has a body.
     #[error("a request has no body here; send it without one")]
     Body,
+    /// Its body is no JSON.
+    #[error("the body has to be JSON; set the header Content-Type to application/json")]
+    NoJson,
+    /// The query of a stream is illegal.
+    #[error("the query is too long, names too much or has unknown parts; open fewer plots")]
+    Query,
     /// There is no such document.
     #[error("there is no such page; try / or /metrics")]
     NoPage,
@@ -50,39 +91,94 @@ pub(crate) enum RequestError {
 impl RequestError {
     pub(crate) const fn status(self) -> StatusCode {
         match self {
-            Self::NoHost => StatusCode::BAD_REQUEST,
-            Self::OtherHost => StatusCode::FORBIDDEN,
-            Self::Method => StatusCode::METHOD_NOT_ALLOWED,
+            Self::NoHost | Self::Query => StatusCode::BAD_REQUEST,
+            Self::NoToken => StatusCode::UNAUTHORIZED,
+            Self::OtherHost | Self::OtherSite => StatusCode::FORBIDDEN,
+            Self::Method(_) => StatusCode::METHOD_NOT_ALLOWED,
             Self::Body => StatusCode::PAYLOAD_TOO_LARGE,
+            Self::NoJson => StatusCode::UNSUPPORTED_MEDIA_TYPE,
             Self::NoPage => StatusCode::NOT_FOUND,
         }
     }
 }
 
-/// Returns the requested document, for a server that listens on this address.
-pub(crate) fn document(head: Head<'_>, listens: IpAddr) -> Result<Document, RequestError> {
-    check_host(head, listens)?;
-    if head.method != Method::GET {
-        return Err(RequestError::Method);
+/// Returns the requested document.
+pub(crate) fn document(head: Head<'_>, access: Access<'_>) -> Result<Document, RequestError> {
+    let host = check_host(head, access.listens)?;
+    let path = head.uri.path();
+    if path == "/metrics" {
+        check_get(head)?;
+        return Ok(Document::Metrics(format(head.headers)));
     }
-    if head.has_body {
-        return Err(RequestError::Body);
+    if path == "/" && has_token(head.uri.query(), access.token) {
+        check_get(head)?;
+        return Ok(Document::Login);
     }
-    match head.uri.path() {
-        "/metrics" => Ok(Document::Metrics(format(head.headers))),
-        "/" => Ok(Document::Page),
-        _ => Err(RequestError::NoPage),
+    if !access.token.is_in(head.headers, access.cookie) {
+        return Err(RequestError::NoToken);
+    }
+    match path {
+        "/api/stream" => {
+            check_get(head)?;
+            check_site(head.headers, &host, head.headers.contains_key(ORIGIN))?;
+            let query = head.uri.query().unwrap_or_default();
+            Look::of_query(query).map(Document::Stream).ok_or(RequestError::Query)
+        }
+        "/api/parameters" if *head.method == Method::POST => {
+            check_site(head.headers, &host, true)?;
+            if !head.headers.get(CONTENT_TYPE).is_some_and(|found| found == "application/json") {
+                return Err(RequestError::NoJson);
+            }
+            Ok(Document::Set)
+        }
+        "/api/parameters" if *head.method != Method::GET => Err(RequestError::Method("GET, POST")),
+        "/api/parameters" => {
+            check_get(head)?;
+            Ok(Document::Parameters)
+        }
+        _ => {
+            let file = assets::find(path).ok_or(RequestError::NoPage)?;
+            check_get(head)?;
+            Ok(Document::File(file))
+        }
     }
 }
 
-fn check_host(head: Head<'_>, listens: IpAddr) -> Result<(), RequestError> {
+fn check_get(head: Head<'_>) -> Result<(), RequestError> {
+    if *head.method != Method::GET {
+        return Err(RequestError::Method("GET"));
+    }
+    if head.has_body { Err(RequestError::Body) } else { Ok(()) }
+}
+
+/// Returns whether the query of the page's address has the token.
+fn has_token(query: Option<&str>, token: &Token) -> bool {
+    query.and_then(|query| query.strip_prefix("token=")).is_some_and(|text| token.is(text))
+}
+
+/// Checks that the page itself has sent a request: by its `Origin`, which a browser sends with each request that
+/// writes, and by the statement of newer browsers.
+fn check_site(headers: &HeaderMap, host: &Authority, needs_origin: bool) -> Result<(), RequestError> {
+    let own = format!("http://{host}");
+    let mut origins = headers.get_all(ORIGIN).iter();
+    let is_own = match (origins.next(), origins.next()) {
+        (None, _) => !needs_origin,
+        (Some(origin), None) => origin.as_bytes().eq_ignore_ascii_case(own.as_bytes()),
+        (Some(_), Some(_)) => false,
+    };
+    let is_stated = headers.get(FETCH_SITE).is_none_or(|site| site == "same-origin");
+    if is_own && is_stated { Ok(()) } else { Err(RequestError::OtherSite) }
+}
+
+/// Returns the host that the request is for.
+fn check_host(head: Head<'_>, listens: IpAddr) -> Result<Authority, RequestError> {
     let mut hosts = head.headers.get_all(HOST).iter();
     let (Some(host), None) = (hosts.next(), hosts.next()) else { return Err(RequestError::NoHost) };
     let host = host.to_str().ok().and_then(|text| text.parse::<Authority>().ok());
     let host = host.ok_or(RequestError::NoHost)?;
     let is_own = |authority: &Authority| is_own_host(authority.host(), listens);
     if is_own(&host) && head.uri.authority().is_none_or(is_own) {
-        return Ok(());
+        return Ok(host);
     }
     Err(RequestError::OtherHost)
 }
@@ -109,93 +205,4 @@ fn format(headers: &HeaderMap) -> Format {
 }
 
 #[cfg(test)]
-mod tests {
-    use std::net::{Ipv4Addr, Ipv6Addr};
-
-    use hyper::{Request, header::HeaderName};
-
-    use super::*;
-
-    const LOOPBACK: IpAddr = IpAddr::V4(Ipv4Addr::LOCALHOST);
-
-    fn asked(
-        method: Method,
-        uri: &str,
-        headers: &[(HeaderName, &str)],
-        listens: IpAddr,
-    ) -> Result<Document, RequestError> {
-        let mut request = Request::builder().method(method).uri(uri);
-        for (name, value) in headers {
-            request = request.header(name, *value);
-        }
-        let request = request.body(()).expect("a valid request");
-        let (method, uri, headers) = (request.method(), request.uri(), request.headers());
-        document(Head { method, uri, headers, has_body: false }, listens)
-    }
-
-    fn from_host(host: &str, listens: IpAddr) -> Result<Document, RequestError> {
-        asked(Method::GET, "/", &[(HOST, host)], listens)
-    }
-
-    #[test]
-    fn only_requests_for_this_host_are_answered() {
-        for host in ["localhost", "LOCALHOST:9464", "127.0.0.1:9464", "127.0.0.9", "[::1]:9464", "[::1]"] {
-            assert_eq!(from_host(host, LOOPBACK), Ok(Document::Page), "{host}");
-        }
-        for host in ["evil.example", "localhost.evil.example:9464", "10.0.0.1", "127.0.0.1.evil.example"] {
-            assert_eq!(from_host(host, LOOPBACK), Err(RequestError::OtherHost), "{host}");
-        }
-        for host in ["", "a b", "[::1"] {
-            assert_eq!(from_host(host, LOOPBACK), Err(RequestError::NoHost), "{host:?}");
-        }
-    }
-
-    #[test]
-    fn listened_address_is_a_host_and_no_name_is() {
-        let listens = IpAddr::from([10, 0, 0, 1]);
-        assert_eq!(from_host("10.0.0.1:9464", listens), Ok(Document::Page));
-        assert_eq!(from_host("10.0.0.2:9464", listens), Err(RequestError::OtherHost));
-        for listens in [IpAddr::V4(Ipv4Addr::UNSPECIFIED), IpAddr::V6(Ipv6Addr::UNSPECIFIED)] {
-            assert_eq!(from_host("10.0.0.2:9464", listens), Ok(Document::Page));
-            assert_eq!(from_host("robot.example:9464", listens), Err(RequestError::OtherHost));
-        }
-    }
-
-    #[test]
-    fn host_is_required_once_also_for_full_address() {
-        assert_eq!(asked(Method::GET, "/", &[], LOOPBACK), Err(RequestError::NoHost));
-        let two = [(HOST, "localhost"), (HOST, "evil.example")];
-        assert_eq!(asked(Method::GET, "/", &two, LOOPBACK), Err(RequestError::NoHost));
-        let full = asked(Method::GET, "http://evil.example/", &[(HOST, "localhost")], LOOPBACK);
-        assert_eq!(full, Err(RequestError::OtherHost));
-    }
-
-    #[test]
-    fn each_page_has_its_path_and_others_are_refused() {
-        let own = [(HOST, "localhost")];
-        let open = Ok(Document::Metrics(Format::OpenMetrics));
-        assert_eq!(asked(Method::GET, "/metrics?x=1", &own, LOOPBACK), open);
-        for path in ["/metrics/", "/favicon.ico", "//", "/../metrics"] {
-            assert_eq!(asked(Method::GET, path, &own, LOOPBACK), Err(RequestError::NoPage), "{path}");
-        }
-        for method in [Method::POST, Method::PUT, Method::DELETE, Method::OPTIONS, Method::HEAD] {
-            assert_eq!(asked(method, "/metrics", &own, LOOPBACK), Err(RequestError::Method));
-        }
-        let headers = HeaderMap::from_iter([(HOST, "localhost".parse().expect("a valid value"))]);
-        let with_body =
-            Head { method: &Method::GET, uri: &Uri::from_static("/"), headers: &headers, has_body: true };
-        assert_eq!(document(with_body, LOOPBACK), Err(RequestError::Body));
-    }
-
-    #[test]
-    fn older_format_is_for_clients_that_name_it_alone() {
-        let format =
-            |accept: &str| asked(Method::GET, "/metrics", &[(HOST, "localhost"), (ACCEPT, accept)], LOOPBACK);
-        let prometheus =
-            "application/openmetrics-text;version=1.0.0;q=0.5,text/plain;version=0.0.4;q=0.2,*/*;q=0.1";
-        for accept in ["*/*", "application/openmetrics-text", prometheus] {
-            assert_eq!(format(accept), Ok(Document::Metrics(Format::OpenMetrics)), "{accept}");
-        }
-        assert_eq!(format("text/plain;version=0.0.4"), Ok(Document::Metrics(Format::PlainText)));
-    }
-}
+mod tests;

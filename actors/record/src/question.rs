@@ -46,6 +46,36 @@ pub struct AskRecord {
     /// The payload types of which the answer has the structure, as far as the node knows it.
     #[serde(default, deserialize_with = "at_most::<_, _, SCHEMAS_MAX>")]
     pub schemas: Vec<Kind>,
+    /// The counters of this program's recording so far, which the node reports; `None` if it writes no file.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub counts: Option<RecordCounts>,
+}
+
+/// The messages of a recording, as the program that writes it counts them.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct RecordCounts {
+    /// Messages that the node has counted for it.
+    pub seen: u64,
+    /// Of those, the messages that are in no file.
+    pub dropped: u64,
+}
+
+impl RecordCounts {
+    /// Adds the counters of another recording.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew_record::RecordCounts;
+    ///
+    /// let mut sum = RecordCounts { seen: 5, dropped: 1 };
+    /// sum.add(RecordCounts { seen: 2, dropped: 0 });
+    /// assert_eq!(sum, RecordCounts { seen: 7, dropped: 1 });
+    /// ```
+    pub const fn add(&mut self, other: Self) {
+        self.seen = self.seen.saturating_add(other.seen);
+        self.dropped = self.dropped.saturating_add(other.dropped);
+    }
 }
 
 impl Payload for AskRecord {

@@ -11,12 +11,14 @@
 //!   [`Connection`], such as an endpoint of NodeAPI.
 //! - [`Recorder`] takes a reader of the journal and a writer of the file. Its owner calls [`Recorder::pump`] every few
 //!   milliseconds. It knows no node, no socket and no clock: names and times are arguments.
+//! - [`Follower`] hands over the messages of a node as they pass, for programs that show them.
 //! - [`FrozenRing`] is a journal that nothing writes any more: a frozen span, or the ring of a dead node.
 
 mod channels;
 mod error;
 mod facts;
 mod file_name;
+mod follower;
 mod frozen;
 mod names;
 mod order;
@@ -30,6 +32,7 @@ mod span;
 mod tests;
 
 pub use error::RecordingError;
+pub use follower::{Follower, Seen};
 pub use frozen::{FrozenFile, FrozenRing, RingOrigin};
 pub use names::Names;
 pub use order::WINDOW;

@@ -12,7 +12,7 @@ use std::{
 use sinew_bag::{BagError, BagWriter, Compression, Origin, Totals};
 use sinew_client::Endpoint;
 use sinew_model::config::{RecordCompression, RecordConfig};
-use sinew_record::{AskRecord, RecordReport, SCHEMAS_MAX, Selection};
+use sinew_record::{AskRecord, RecordCounts, RecordReport, SCHEMAS_MAX, Selection};
 use sinew_runtime::{
     log,
     tid::{AppAddress, NodeAddress, Tid},
@@ -26,9 +26,9 @@ use crate::{RecordingError, file_name, names::Names, recorder::Recorder, setup::
 /// Pause after the journal was read to its end. Its 64 MiB, unless configured otherwise, last for far longer.
 const PAUSE: Duration = Duration::from_millis(5);
 /// Interval at which the recording is renewed at the node: its lease is 5 s.
-const RENEWAL: Duration = Duration::from_secs(1);
+pub(crate) const RENEWAL: Duration = Duration::from_secs(1);
 /// Time limit of a further question: meanwhile the journal is not read.
-const RENEWED_WITHIN: Duration = Duration::from_millis(300);
+pub(crate) const RENEWED_WITHIN: Duration = Duration::from_millis(300);
 /// Maximum questions for names and structures between two renewals. Further channels have addresses in their topics,
 /// and views as JSON.
 const QUESTIONS_MAX: u32 = 64;
@@ -253,7 +253,7 @@ impl<C: Connection> Session<C> {
                 })
             }
             Err(why) => {
-                leave(&mut connection);
+                leave(&mut connection, None);
                 Err(why)
             }
         }
@@ -318,7 +318,7 @@ impl<C: Connection> Session<C> {
             totals
         });
         // Without it the recording would end 5 s later. A node that has died does not answer.
-        leave(&mut connection);
+        leave(&mut connection, Some(counts(&totals)));
         Summary { file, node, end, totals, faults }
     }
 
@@ -393,6 +393,7 @@ impl<C: Connection> Session<C> {
     /// shows.
     fn renew(&mut self, schemas: Vec<Kind>) {
         self.question.schemas = schemas;
+        self.question.counts = Some(counts(&self.recorder.totals()));
         let within = RENEWED_WITHIN.min(self.connection.patience());
         let answer = ask(&mut self.connection, &self.question, within);
         self.answers = answer.is_ok();
@@ -402,8 +403,13 @@ impl<C: Connection> Session<C> {
     }
 }
 
+/// Returns the counters that the node reports for this program.
+const fn counts(totals: &Totals) -> RecordCounts {
+    RecordCounts { seen: totals.seen, dropped: totals.dropped }
+}
+
 /// Starts or renews the recording at the node.
-fn ask<C: Connection>(
+pub(crate) fn ask<C: Connection>(
     connection: &mut C,
     question: &AskRecord,
     within: Duration,
@@ -415,11 +421,11 @@ fn ask<C: Connection>(
     }
 }
 
-/// Ends the recording at the node.
-fn leave<C: Connection>(connection: &mut C) {
+/// Ends the recording at the node, with the last counters of a file.
+pub(crate) fn leave<C: Connection>(connection: &mut C, counts: Option<RecordCounts>) {
     let within = RENEWED_WITHIN.min(connection.patience());
     // The answer says nothing.
-    let _ = connection.ask(&AskRecord { ends: true, ..AskRecord::default() }, within);
+    let _ = connection.ask(&AskRecord { ends: true, counts, ..AskRecord::default() }, within);
 }
 
 /// Opens the journal, and creates the file.

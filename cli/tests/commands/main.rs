@@ -7,6 +7,7 @@ mod fault;
 mod keys;
 mod mistakes;
 mod output;
+mod page;
 mod param;
 mod play;
 mod record;

@@ -6,7 +6,8 @@ use super::{
     samples::Samples,
     table::{
         AGE, ENTRY_UP, LEFT_OUT, NODE_FIFO, NODE_IDLE_CLIENTS, NODE_LATENESS, NODE_LOST, NODE_STALL_LONGEST,
-        NODE_STALLS, NODE_STOPPING, NODE_TROUBLED, NODE_UP, NODE_UPTIME, REFUSED, TOOK,
+        NODE_STALLS, NODE_STOPPING, NODE_TROUBLED, NODE_UP, NODE_UPTIME, RECORDER_DROPPED, RECORDER_SEEN,
+        REFUSED, TOOK,
     },
 };
 use crate::{
@@ -69,6 +70,10 @@ pub(super) fn add_node(samples: &mut Samples, answers: &Answers, label: &str) {
         for (quantile, nanos) in quantiles {
             samples.level(&NODE_LATENESS, [label, quantile], nanos as f64 / 1e9);
         }
+    }
+    if let Some(recording) = &node.recording {
+        samples.count(&RECORDER_SEEN, [label], recording.seen);
+        samples.count(&RECORDER_DROPPED, [label], recording.dropped);
     }
     samples.level(&LEFT_OUT, [label, "applications"], apps.left_out as f64);
     samples.level(&LEFT_OUT, [label, "barriers"], apps.barriers_left_out as f64);

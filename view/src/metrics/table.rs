@@ -98,6 +98,13 @@ pub(super) const NODE_LATENESS: Metric = seconds(
     &["node", "quantile"],
     "Time by which a thread woke late at 1 kHz after the start of the node.",
 );
+pub(super) const RECORDER_SEEN: Metric = counter(
+    "recorder_messages",
+    &["node"],
+    "Messages that recordings of the node were to have, as the programs that write them report.",
+);
+pub(super) const RECORDER_DROPPED: Metric =
+    counter("recorder_dropped", &["node"], "Of these, the messages that are in no file.");
 pub(super) const NODE_IDLE_CLIENTS: Metric =
     gauge("node_idle_clients", NODE, "Clients that do not read their queued messages.");
 pub(super) const REFUSED: Metric =
@@ -201,6 +208,8 @@ pub const METRICS: &[Metric] = &[
     NODE_STALL_LONGEST,
     NODE_FIFO,
     NODE_LATENESS,
+    RECORDER_SEEN,
+    RECORDER_DROPPED,
     NODE_TROUBLED,
     NODE_IDLE_CLIENTS,
     REFUSED,

@@ -11,7 +11,8 @@ use sinew::{
     audit::{Account, Entry, NodeAudit, Place},
     inspect::{
         AppReport, AppsReport, BarrierReport, DialReport, GuardReport, LinkReport, LostReport, Missing,
-        NodeReport, PeerReport, RealTimeReport, StallReport, StreamReport, TreeLine, TreeReport, WaitReport,
+        NodeReport, PeerReport, RealTimeReport, RecordingReport, StallReport, StreamReport, TreeLine,
+        TreeReport, WaitReport,
     },
     message::Class,
 };
@@ -58,6 +59,7 @@ pub(crate) fn node_report(node: NodeAddress, name: &str) -> NodeReport {
         unguarded: Vec::new(),
         lost_echoes: Vec::new(),
         real_time: None,
+        recording: None,
         guards: Vec::new(),
         guards_left_out: 0,
         refusals_left_out: 0,
@@ -92,6 +94,7 @@ pub(crate) fn snapshot() -> Snapshot {
     hip.lost = vec![lost(node(3), "ankle", "gave up: the address is in use")];
     hip.own_stalls = Some(StallReport { count: 2, longest_us: 300_000, last_us: Some(1) });
     hip.real_time = Some(real_time());
+    hip.recording = Some(RecordingReport { seen: 900, dropped: 3, ..RecordingReport::default() });
     hip.peers = vec![peer()];
     hip.guards = [None, Some("Silent")].map(guard).to_vec();
     let knee = node_report(node(2), "knee");

@@ -43,10 +43,11 @@ pub use reports::{
     FROZEN_SPANS_MAX, ForeignReport, FreezeReport, FrozenFacts, FrozenPart, FrozenReport, FrozenSpan,
     GroupReport, GuardReport, IdleReport, KindReport, LinkReport, LostEchoReport, LostReport, MismatchReport,
     MismatchesReport, Missing, NodeReport, PEERS_MAX, PeerReport, Ping, REACHED_MAX, RECORDED_MAX,
-    ReachReport, Reached, RealTimeReport, RecordReport, RecordedApp, RecordedType, RefusalReport,
-    ReloadReport, RouteReport, SCHEMAS_MAX, SEEN_BYTES_MAX, SEEN_MAX, SchemaReport, SchemasReport,
-    SecurityReport, SeenMessage, SourceReport, StallReport, StreamReport, TREE_MAX, TreeLine, TreeReport,
-    TroubleReport, TypeUser, UnguardedReport, UnhandledReport, WaitReport, WatchReport,
+    ReachReport, Reached, RealTimeReport, RecordCounts, RecordReport, RecordedApp, RecordedType,
+    RecordingReport, RefusalReport, ReloadReport, RouteReport, SCHEMAS_MAX, SEEN_BYTES_MAX, SEEN_MAX,
+    SchemaReport, SchemasReport, SecurityReport, SeenMessage, SourceReport, StallReport, StreamReport,
+    TREE_MAX, TreeLine, TreeReport, TroubleReport, TypeUser, UnguardedReport, UnhandledReport, WaitReport,
+    WatchReport,
 };
 pub use sinew_record::{PeerClock, Selection};
 

@@ -12,11 +12,15 @@ use crate::{NodeState, recording};
 
 /// Answers the question of a program that records.
 pub(crate) fn recorded(state: &Arc<NodeState>, question: &Message) -> Result<RecordReport, Rejection> {
-    let AskRecord { selection, ends, schemas } = question.decode().map_err(|_| Rejection::Malformed)?;
+    let AskRecord { selection, ends, schemas, counts } =
+        question.decode().map_err(|_| Rejection::Malformed)?;
     let program = question.header.source;
     if program.node != state.ctx.node || !access::is_of_the_nodes_user(state, program.app) {
         let why = "a node records for programs of its own host and user, and of root, only: run `sinew record` there";
         return Ok(refused(why.to_owned()));
+    }
+    if let Some(counts) = counts {
+        state.recording.note_counts(program, counts);
     }
     if ends {
         state.recording.leave(state, program);

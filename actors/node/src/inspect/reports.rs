@@ -10,6 +10,7 @@ mod peers;
 mod reach;
 mod real_time;
 mod record;
+mod recording;
 mod refused;
 mod security;
 mod tree;
@@ -27,6 +28,7 @@ pub use peers::{
 };
 pub use reach::{AskGroups, AskReach, GroupReport, REACHED_MAX, ReachReport, Reached};
 pub use real_time::RealTimeReport;
+pub use recording::RecordingReport;
 pub use refused::{LostEchoReport, RefusalReport, UnguardedReport, UnhandledReport};
 pub use security::{CertificateReport, SecurityReport};
 pub use tree::{AskTree, TREE_MAX, TreeLine, TreeReport};
@@ -38,8 +40,8 @@ pub use watch::{AskWatch, SEEN_BYTES_MAX, SEEN_MAX, SeenMessage, WatchReport};
 use serde::{Deserialize, Serialize};
 pub use sinew_record::{
     AskFreeze, AskFrozen, AskRecord, FROZEN_BUSY, FROZEN_BYTES_MAX, FROZEN_SPANS_MAX, FreezeReport,
-    FrozenFacts, FrozenPart, FrozenReport, FrozenSpan, RECORDED_MAX, RecordReport, RecordedApp, RecordedType,
-    SCHEMAS_MAX,
+    FrozenFacts, FrozenPart, FrozenReport, FrozenSpan, RECORDED_MAX, RecordCounts, RecordReport, RecordedApp,
+    RecordedType, SCHEMAS_MAX,
 };
 use sinew_runtime::wire::{Class, Payload, encode};
 

@@ -26,7 +26,7 @@ use std::{
 
 use rustix::time::{ClockId, clock_gettime};
 use sinew_model::context::NodeContext;
-use sinew_record::{NodeFact, OutcomeTap, RecordTap, Selection};
+use sinew_record::{NodeFact, OutcomeTap, RecordCounts, RecordTap, Selection};
 use sinew_runtime::{
     log::{self, LogObserver},
     outcome::{self, OutcomeObserver},
@@ -43,7 +43,7 @@ pub(crate) use flight::Flight;
 pub(crate) use names::{journal_kinds, report};
 pub(crate) use triggers::Triggers;
 
-use crate::NodeState;
+use crate::{NodeState, inspect::RecordingReport};
 
 /// Time without a question after which a recording ends that a program asked for.
 pub(crate) const LEASE: Duration = Duration::from_secs(5);
@@ -72,9 +72,19 @@ struct State {
     /// That of the configuration.
     configured: Option<Selection>,
     /// Those of programs, each until its lease ends.
-    programs: BTreeMap<Tid, (Selection, Time)>,
+    programs: BTreeMap<Tid, Program>,
+    /// The counters of recordings that have ended.
+    ended: RecordCounts,
     /// Whether the node ends, and records no more.
     is_closed: bool,
+}
+
+/// A program that records.
+struct Program {
+    selection: Selection,
+    /// The end of its lease.
+    until: Time,
+    counts: RecordCounts,
 }
 
 /// A recording that runs.
@@ -184,7 +194,8 @@ impl Recording {
         if state.programs.len() >= PROGRAMS_MAX && !state.programs.contains_key(&program) {
             return Err(RecordError::Programs);
         }
-        state.programs.insert(program, (selection, now + LEASE));
+        let counts = state.programs.get(&program).map_or_else(RecordCounts::default, |known| known.counts);
+        state.programs.insert(program, Program { selection, until: now + LEASE, counts });
         if let Err(why) = self.start(node, &names, &mut state) {
             state.programs.remove(&program);
             return Err(why);
@@ -197,8 +208,30 @@ impl Recording {
     pub(crate) fn leave(&self, node: &NodeState, program: Tid) {
         let names = KnownNames::of(node);
         let mut state = self.lock();
-        if state.programs.remove(&program).is_some() {
+        if let Some(ended) = state.programs.remove(&program) {
+            state.ended.add(ended.counts);
             self.settle(node, &names, &mut state);
+        }
+    }
+
+    /// Notes the counters that a program has reported, if it records.
+    pub(crate) fn note_counts(&self, program: Tid, counts: RecordCounts) {
+        if let Some(program) = self.lock().programs.get_mut(&program) {
+            program.counts = counts;
+        }
+    }
+
+    /// Returns the state of the recording.
+    pub(crate) fn report_state(&self) -> RecordingReport {
+        let state = self.lock();
+        let mut counts = state.ended;
+        state.programs.values().for_each(|program| counts.add(program.counts));
+        RecordingReport {
+            is_configured: state.configured.is_some(),
+            programs: u32::try_from(state.programs.len()).unwrap_or(u32::MAX),
+            written_bytes: state.active.as_ref().map_or(0, |active| active.journal.written_bytes()),
+            seen: counts.seen,
+            dropped: counts.dropped,
         }
     }
 
@@ -286,7 +319,7 @@ impl Recording {
     /// Fits the tap to the selections, or ends the recording without any.
     fn settle(&self, node: &NodeState, names: &KnownNames, state: &mut State) {
         let State { active: Some(active), configured, programs, .. } = state else { return };
-        let mut all = configured.iter().chain(programs.values().map(|(selection, _)| selection));
+        let mut all = configured.iter().chain(programs.values().map(|program| &program.selection));
         let Some(mut sum) = all.next().cloned() else {
             if let Some(active) = state.active.take() {
                 self.remove(node, &active);
@@ -309,7 +342,14 @@ impl Recording {
         let names = KnownNames::of(node);
         let mut state = self.lock();
         let before = state.programs.len();
-        state.programs.retain(|_, (_, until)| *until > now);
+        let State { programs, ended, .. } = &mut *state;
+        programs.retain(|_, program| {
+            let is_leased = program.until > now;
+            if !is_leased {
+                ended.add(program.counts);
+            }
+            is_leased
+        });
         if state.programs.len() < before {
             self.settle(node, &names, &mut state);
         }

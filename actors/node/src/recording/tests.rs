@@ -456,3 +456,24 @@ fn slow_copy_does_not_hold_the_recording() {
     assert_eq!(flight.store().spans().len(), 1);
     std::fs::remove_dir_all(folder).unwrap();
 }
+
+#[test]
+fn counters_of_a_program_stay_after_its_end() {
+    let node = node("counters", |_| {});
+    let (hip, knee) = (app(&node, "hip"), app(&node, "knee"));
+    let ask = |program| node.recording.ask(&node, program, Selection::default(), Time::now()).map(drop);
+    ask(hip).expect("it begins");
+    node.recording.note_counts(hip, RecordCounts { seen: 10, dropped: 2 });
+    ask(hip).expect("it is renewed");
+    ask(knee).expect("it joins");
+    node.recording.note_counts(knee, RecordCounts { seen: 5, dropped: 0 });
+    let report = node.recording.report_state();
+    assert_eq!((report.programs, report.seen, report.dropped), (2, 15, 2));
+    node.recording.leave(&node, hip);
+    node.recording.leave(&node, knee);
+    let report = node.recording.report_state();
+    assert_eq!((report.programs, report.seen, report.dropped), (0, 15, 2));
+    // A program that does not record has no counters.
+    node.recording.note_counts(hip, RecordCounts { seen: 99, dropped: 99 });
+    assert_eq!(node.recording.report_state().seen, 15);
+}

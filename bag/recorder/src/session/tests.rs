@@ -10,7 +10,7 @@ use sinew_schema::{Field, Schema, Shape};
 use sinew_shm::journal::{Journal, Options};
 
 use super::*;
-use crate::Recording;
+use crate::{Follower, Recording};
 
 const NODE: NodeAddress = NodeAddress::new(0x7f00_0002);
 /// The watchdog of a test that waits.
@@ -243,6 +243,8 @@ fn messages_beyond_the_maximum_size_are_counted() {
     let Totals { seen, written, dropped, .. } = summary.totals;
     assert!(seen == 2_000 && written > 0 && dropped > 0 && seen == written + dropped, "{summary:?}");
     assert!(summary.is_whole(), "its limit is no fault: {summary:?}");
+    let last = lock(&node.asked).last().and_then(|question| question.counts);
+    assert_eq!(last, Some(RecordCounts { seen, dropped }), "the node reports them");
 }
 
 #[test]
@@ -258,4 +260,30 @@ fn recordings_of_one_second_have_numbers() {
     assert!(names[1].display().to_string().ends_with("/leg-1970-01-01-000000-2.mcap"), "{names:?}");
     // And: a name without the time is not changed
     assert!(create_at("leg.mcap").is_ok() && create_at("leg.mcap").is_err());
+}
+
+#[test]
+fn follower_hands_over_messages_and_writes_no_file() {
+    let node = Node::new("follower");
+    let mut follower = Follower::begin(node.link(), Selection::default()).unwrap();
+    let [angle, torque] = kinds();
+    node.write(angle, 7);
+    node.write(torque, 8);
+    let mut seen = Vec::new();
+    follower
+        .poll(&mut |message| {
+            let name = message.names.type_name(message.header.kind).map(str::to_owned);
+            seen.push((message.header.sequence, message.destination, name, message.payload.to_vec()));
+        })
+        .unwrap();
+    let payload = b"\x81\xa1x\x05".to_vec();
+    let message = |sequence, name: &str| (sequence, tid(0x1002), Some(name.to_owned()), payload.clone());
+    assert_eq!(seen, [message(7, "test.angle"), message(8, "test.torque")]);
+    // And: another selection reaches the node at once
+    let apps = vec!["knee".to_owned()];
+    follower.select(Selection { apps: apps.clone(), ..Selection::default() }).unwrap();
+    assert_eq!(lock(&node.asked).last().map(|question| question.selection.apps.clone()), Some(apps));
+    drop(follower.finish());
+    assert!(lock(&node.asked).last().is_some_and(|question| question.ends && question.counts.is_none()));
+    assert!(!node.folder.join("leg.mcap").exists());
 }

@@ -9,8 +9,8 @@ use sinew_runtime::{
 
 use super::{
     ForeignReport, GuardReport, IdleReport, LISTED_MAX, LostEchoReport, LostReport, PeerReport,
-    RealTimeReport, RefusalReport, Report, SecurityReport, Shortened, SourceReport, StallReport,
-    TroubleReport, UnguardedReport, UnhandledReport,
+    RealTimeReport, RecordingReport, RefusalReport, Report, SecurityReport, Shortened, SourceReport,
+    StallReport, TroubleReport, UnguardedReport, UnhandledReport,
 };
 
 /// Maximum number of nodes in one answer.
@@ -144,6 +144,9 @@ pub struct NodeReport {
     /// version.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub real_time: Option<RealTimeReport>,
+    /// The state of its recording; `None`: an older version.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub recording: Option<RecordingReport>,
     /// The outputs that applications in the node's process guard, in the order of their creation.
     #[serde(
         default,

@@ -1,0 +1,317 @@
+//! The answers to requests: metrics, files of the page, its stream, and its writes.
+
+use std::{
+    net::IpAddr,
+    sync::{Arc, Mutex, MutexGuard, PoisonError},
+    time::Duration,
+};
+
+use http_body_util::{BodyExt as _, Limited};
+use hyper::{
+    Request, Response, StatusCode,
+    body::{Body as _, Bytes, Incoming},
+    header::{
+        ALLOW, CACHE_CONTROL, CONTENT_SECURITY_POLICY, CONTENT_TYPE, HeaderValue, REFERRER_POLICY,
+        SET_COOKIE, X_CONTENT_TYPE_OPTIONS,
+    },
+};
+use serde::Deserialize;
+use serde_json::json;
+use sinew::{
+    Time,
+    parameters::{NamedValue, ParameterOutcome, SetParameters, Value},
+};
+use tokio::{sync::Semaphore, task::spawn_blocking, time::timeout};
+
+use crate::{
+    assets::{self, Asset},
+    auth::{self, Token},
+    body::Content,
+    cache::{Cache, FRESH},
+    events::EventLog,
+    metrics::{self, Format},
+    model,
+    pages::{Pages, wall_s},
+    request::{self, Access, Document, Head, RequestError},
+    source::Source,
+    stream::{self, Line},
+};
+
+/// Time limit from the request to the begin of the answer, except for questions to applications.
+const ANSWER_WITHIN: Duration = Duration::from_secs(5);
+/// Time limit for questions to applications.
+const ASKED_WITHIN: Duration = Duration::from_secs(12);
+/// Bytes of the body of a request.
+const BODY_BYTES_MAX: usize = 16 * 1_024;
+/// Parameters of one set.
+const VALUES_MAX: usize = 64;
+/// Questions to applications at a time. Further ones wait.
+const QUESTIONS_MAX: usize = 2;
+
+/// The parts that all connections share.
+pub(crate) struct Shared {
+    pub(crate) source: Arc<dyn Source>,
+    pub(crate) cache: Cache,
+    pub(crate) pages: Pages,
+    log: Mutex<EventLog>,
+    questions: Arc<Semaphore>,
+}
+
+impl Shared {
+    pub(crate) fn new(source: Arc<dyn Source>, cache: Cache, pages: Pages, log: EventLog) -> Self {
+        let questions = Arc::new(Semaphore::new(QUESTIONS_MAX));
+        Self { source, cache, pages, log: Mutex::new(log), questions }
+    }
+
+    pub(crate) fn log(&self) -> MutexGuard<'_, EventLog> {
+        self.log.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// The server's own address and token.
+#[derive(Debug)]
+pub(crate) struct Identity {
+    pub(crate) listens: IpAddr,
+    pub(crate) token: Token,
+    pub(crate) cookie: String,
+}
+
+/// A set of parameters, as the page sends it.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Order {
+    app: String,
+    /// The new values, each as a text; without any, the last set is undone.
+    #[serde(default)]
+    values: Vec<OrderedValue>,
+    #[serde(default)]
+    undo: bool,
+}
+
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct OrderedValue {
+    name: String,
+    value: String,
+}
+
+impl Order {
+    /// Reads a body.
+    fn read(body: &[u8]) -> Result<(String, SetParameters), String> {
+        let order: Self = serde_json::from_slice(body).map_err(|why| format!("this is no set: {why}"))?;
+        if order.undo && order.values.is_empty() {
+            return Ok((order.app, SetParameters::Undo));
+        }
+        if order.undo || order.values.is_empty() || order.values.len() > VALUES_MAX {
+            return Err(format!("a set has 1 to {VALUES_MAX} values, or undoes the last one"));
+        }
+        let value = |one: OrderedValue| match one.value.trim().parse::<Value>() {
+            Ok(value) => Ok(NamedValue { name: one.name, value }),
+            Err(why) => Err(format!("{}: {why}", one.name)),
+        };
+        let values: Result<Vec<_>, _> = order.values.into_iter().map(value).collect();
+        Ok((order.app, SetParameters::Values(values?)))
+    }
+}
+
+/// Answers a request.
+pub(crate) async fn answer(
+    request: Request<Incoming>,
+    shared: &Arc<Shared>,
+    (own, line): (&Identity, &Arc<Line>),
+) -> Response<Content> {
+    let (head, body) = request.into_parts();
+    let has_body = !body.is_end_stream();
+    let of = Head { method: &head.method, uri: &head.uri, headers: &head.headers, has_body };
+    let access = Access { listens: own.listens, token: &own.token, cookie: &own.cookie };
+    match request::document(of, access) {
+        Err(error) => refused(error),
+        Ok(Document::Metrics(format)) => metrics(shared, format).await,
+        Ok(Document::File(asset)) => file(asset),
+        Ok(Document::Login) => {
+            let mut response = file(assets::find("/").expect("the page is part of the program"));
+            if let Ok(cookie) = HeaderValue::from_str(&auth::set_cookie(&own.cookie, &own.token)) {
+                response.headers_mut().insert(SET_COOKIE, cookie);
+            }
+            response
+        }
+        Ok(Document::Stream(look)) => match stream::open(shared, line, look) {
+            Some(events) => response(StatusCode::OK, "text/event-stream", Content::Events(events)),
+            None => plain(StatusCode::SERVICE_UNAVAILABLE, "too many pages are open; close one".to_owned()),
+        },
+        Ok(Document::Parameters) => parameters(shared).await,
+        Ok(Document::Set) => set(shared, body).await,
+    }
+}
+
+async fn metrics(shared: &Shared, format: Format) -> Response<Content> {
+    let Ok(Some(snapshot)) = timeout(ANSWER_WITHIN, shared.cache.snapshot(FRESH)).await else {
+        let why = format!("the nodes gave no answer within {ANSWER_WITHIN:?}; try again");
+        return plain(StatusCode::SERVICE_UNAVAILABLE, why);
+    };
+    match metrics::encode(&snapshot, Time::now(), format) {
+        Ok(text) => response(StatusCode::OK, format.content_type(), Content::whole(text.into())),
+        Err(_) => {
+            plain(StatusCode::INTERNAL_SERVER_ERROR, "the metrics cannot be written as text".to_owned())
+        }
+    }
+}
+
+async fn parameters(shared: &Arc<Shared>) -> Response<Content> {
+    match asked(shared, |source| source.parameters()).await {
+        Ok(Ok(apps)) => json(StatusCode::OK, &model::parameters(&apps)),
+        Ok(Err(why)) | Err(why) => json(StatusCode::SERVICE_UNAVAILABLE, &json!({ "fault": why })),
+    }
+}
+
+/// Sets parameters, and records that in the log of events and on the terminal.
+async fn set(shared: &Arc<Shared>, body: Incoming) -> Response<Content> {
+    let body = match timeout(ANSWER_WITHIN, Limited::new(body, BODY_BYTES_MAX).collect()).await {
+        Ok(Ok(body)) => body.to_bytes(),
+        Ok(Err(_)) | Err(_) => {
+            let why = format!("the body has to arrive whole, with at most {BODY_BYTES_MAX} bytes");
+            return json(StatusCode::PAYLOAD_TOO_LARGE, &json!({ "fault": why }));
+        }
+    };
+    let (app, order) = match Order::read(&body) {
+        Ok(order) => order,
+        Err(why) => return json(StatusCode::BAD_REQUEST, &json!({ "fault": why })),
+    };
+    let (to, ordered) = (app.clone(), order.clone());
+    let outcome = asked(shared, move |source| source.set(&to, &ordered)).await.flatten();
+    let is_applied = matches!(outcome, Ok(ParameterOutcome::Applied { .. }));
+    shared.log().write((wall_s() * 1e3) as u64, app, sentence(&order, &outcome), is_applied);
+    match outcome {
+        Ok(outcome) => json(StatusCode::OK, &json!({ "outcome": outcome })),
+        Err(why) => json(StatusCode::CONFLICT, &json!({ "fault": why })),
+    }
+}
+
+/// Returns the sentence of the log.
+fn sentence(order: &SetParameters, outcome: &Result<ParameterOutcome, String>) -> String {
+    let list = |values: &[NamedValue]| {
+        let each: Vec<_> = values.iter().map(|one| format!("{} = {}", one.name, one.value)).collect();
+        each.join(", ")
+    };
+    let order = match order {
+        SetParameters::Undo => "undo of the last set".to_owned(),
+        SetParameters::Values(values) => list(values),
+    };
+    match outcome {
+        Ok(ParameterOutcome::Applied { tick, values, .. }) => {
+            format!("{order}: applied at tick {tick}: {}", list(values))
+        }
+        Ok(ParameterOutcome::Refused { why }) => format!("{order}: refused: {why}"),
+        Err(why) => format!("{order}: {why}"),
+    }
+}
+
+/// Asks the system on a thread of its own: few at a time, since each asks all nodes.
+async fn asked<R: Send + 'static>(
+    shared: &Arc<Shared>,
+    ask: impl FnOnce(&dyn Source) -> R + Send + 'static,
+) -> Result<R, String> {
+    let work = async {
+        let slot = Arc::clone(&shared.questions).acquire_owned().await.map_err(|_| "it ends".to_owned())?;
+        let source = Arc::clone(&shared.source);
+        let asked = spawn_blocking(move || {
+            let _slot = slot;
+            ask(&*source)
+        });
+        asked.await.map_err(|why| format!("sinew view failed while it asked: {why}; report this"))
+    };
+    let late = format!("no answer within {ASKED_WITHIN:?}; look at the list, the values may have been set");
+    timeout(ASKED_WITHIN, work).await.map_err(|_| late)?
+}
+
+fn file(asset: &'static Asset) -> Response<Content> {
+    response(StatusCode::OK, asset.content_type, Content::whole(Bytes::from_static(asset.bytes)))
+}
+
+fn json(status: StatusCode, value: &serde_json::Value) -> Response<Content> {
+    response(status, "application/json", Content::whole(value.to_string().into()))
+}
+
+fn refused(error: RequestError) -> Response<Content> {
+    let mut response = plain(error.status(), error.to_string());
+    if let RequestError::Method(allowed) = error {
+        response.headers_mut().insert(ALLOW, HeaderValue::from_static(allowed));
+    }
+    response
+}
+
+fn plain(status: StatusCode, text: String) -> Response<Content> {
+    response(status, "text/plain; charset=utf-8", Content::whole((text + "\n").into()))
+}
+
+fn response(status: StatusCode, content_type: &'static str, content: Content) -> Response<Content> {
+    let mut response = Response::new(content);
+    *response.status_mut() = status;
+    let headers = response.headers_mut();
+    let fixed = [
+        (CONTENT_TYPE, content_type),
+        (CACHE_CONTROL, "no-store"),
+        (X_CONTENT_TYPE_OPTIONS, "nosniff"),
+        (REFERRER_POLICY, "no-referrer"),
+        (
+            CONTENT_SECURITY_POLICY,
+            "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src 'self'; \
+             base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
+        ),
+    ];
+    for (name, value) in fixed {
+        headers.insert(name, HeaderValue::from_static(value));
+    }
+    response
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn named(name: &str, value: Value) -> NamedValue {
+        NamedValue { name: name.to_owned(), value }
+    }
+
+    #[test]
+    fn body_is_a_set_or_an_undo() {
+        let read = |text: &str| Order::read(text.as_bytes());
+        let set =
+            read(r#"{"app":"knee","values":[{"name":"gain","value":"0.5"},{"name":"on","value":"true"}]}"#);
+        let values = vec![named("gain", Value::Number(0.5)), named("on", Value::Flag(true))];
+        assert_eq!(set, Ok(("knee".to_owned(), SetParameters::Values(values))));
+        assert_eq!(read(r#"{"app":"knee","undo":true}"#), Ok(("knee".to_owned(), SetParameters::Undo)));
+    }
+
+    #[test]
+    fn other_bodies_are_refused_with_a_reason() {
+        let many = [r#"{"name":"gain","value":"1"}"#; VALUES_MAX + 1].join(",");
+        for body in [
+            String::new(),
+            "[]".to_owned(),
+            r#"{"app":"knee"}"#.to_owned(),
+            r#"{"app":"knee","undo":true,"values":[{"name":"gain","value":"1"}]}"#.to_owned(),
+            r#"{"app":"knee","values":[{"name":"gain","value":"fast"}]}"#.to_owned(),
+            r#"{"app":"knee","undo":true,"role":"operator"}"#.to_owned(),
+            format!(r#"{{"app":"knee","values":[{many}]}}"#),
+        ] {
+            assert!(Order::read(body.as_bytes()).is_err(), "{body}");
+        }
+    }
+
+    #[test]
+    fn write_is_logged_with_its_outcome() {
+        let order = SetParameters::Values(vec![named("gain", Value::Number(0.5))]);
+        let refused = Ok(ParameterOutcome::Refused { why: "outside 0 to 1".to_owned() });
+        assert_eq!(sentence(&order, &refused), "gain = 0.5: refused: outside 0 to 1");
+        let fault = Err("no right".to_owned());
+        assert_eq!(sentence(&SetParameters::Undo, &fault), "undo of the last set: no right");
+    }
+
+    #[test]
+    fn answers_forbid_foreign_and_inline_scripts() {
+        let response = plain(StatusCode::OK, String::new());
+        let policy = response.headers()[CONTENT_SECURITY_POLICY].to_str().expect("it is text");
+        assert!(policy.starts_with("default-src 'none'") && !policy.contains("unsafe"), "{policy}");
+    }
+}

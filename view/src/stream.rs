@@ -1,0 +1,126 @@
+//! The stream of one page: the state of the system several times a second, events, points and tables of messages.
+
+use std::{
+    sync::{
+        Arc,
+        atomic::{AtomicBool, Ordering},
+    },
+    time::Duration,
+};
+
+use hyper::body::Bytes;
+use tokio::{
+    sync::{
+        Notify,
+        mpsc::{Receiver, Sender, channel},
+    },
+    time::{sleep, timeout},
+};
+
+use crate::{
+    answer::Shared,
+    body::event,
+    cache::PAGE_FRESH,
+    look::Look,
+    model,
+    pages::{PageGuard, wall_s},
+};
+
+/// Events that wait for a page.
+const WAITING_MAX: usize = 8;
+/// Time for which a page may read nothing. Then its connection is closed.
+const STUCK_WITHIN: Duration = Duration::from_secs(5);
+
+/// The part of a connection that its stream changes.
+#[derive(Debug, Default)]
+pub(crate) struct Line {
+    is_stream: AtomicBool,
+    cut: Notify,
+}
+
+impl Line {
+    /// Returns whether the connection has a stream, which may last.
+    pub(crate) fn is_stream(&self) -> bool {
+        self.is_stream.load(Ordering::Relaxed)
+    }
+
+    /// Waits until the connection has to be closed, because its client reads nothing.
+    pub(crate) async fn cut(&self) {
+        self.cut.notified().await;
+    }
+}
+
+/// Opens the stream of a page; `None` if there are as many as may be.
+pub(crate) fn open(shared: &Arc<Shared>, line: &Arc<Line>, look: Look) -> Option<Receiver<Bytes>> {
+    let (events, received) = channel(WAITING_MAX);
+    let guard = shared.pages.open(look, events.clone())?;
+    line.is_stream.store(true, Ordering::Relaxed);
+    let (shared, line) = (Arc::clone(shared), Arc::clone(line));
+    tokio::spawn(async move {
+        if send_states(&shared, &events, guard).await == End::Stuck {
+            line.cut.notify_one();
+        }
+    });
+    Some(received)
+}
+
+/// How a stream ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum End {
+    /// The page has closed it.
+    Closed,
+    /// The page reads nothing.
+    Stuck,
+}
+
+async fn send_states(shared: &Shared, events: &Sender<Bytes>, _guard: PageGuard) -> End {
+    let mut last = 0;
+    loop {
+        let Some(snapshot) = shared.cache.snapshot(PAGE_FRESH).await else { return End::Closed };
+        let wall_ms = (wall_s() * 1e3) as u64;
+        let new = {
+            let mut log = shared.log();
+            log.observe(&snapshot, wall_ms);
+            log.after(last)
+        };
+        let mut parts = vec![event("state", &model::state(&snapshot, wall_ms))];
+        if let Some(event_last) = new.last() {
+            last = event_last.number;
+            parts.push(event("log", &serde_json::json!(new)));
+        }
+        for part in parts {
+            match timeout(STUCK_WITHIN, events.send(part)).await {
+                Ok(Ok(())) => {}
+                Ok(Err(_)) => return End::Closed,
+                Err(_) => return End::Stuck,
+            }
+        }
+        sleep(PAGE_FRESH).await;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{cache::Cache, events::EventLog, pages::Pages, source::NoSystem};
+
+    fn shared() -> Shared {
+        let source: Arc<dyn crate::source::Source> = Arc::new(NoSystem);
+        let cache = Cache::start(Arc::clone(&source), Duration::ZERO).expect("a thread");
+        let pages = Pages::start(Arc::clone(&source)).expect("a thread");
+        Shared::new(source, cache, pages, EventLog::default())
+    }
+
+    #[test]
+    fn page_that_reads_nothing_is_cut_off() {
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_time().start_paused(true).build();
+        runtime.expect("a runtime").block_on(async {
+            let shared = Arc::new(shared());
+            let line = Arc::new(Line::default());
+            let received = open(&shared, &line, Look::default()).expect("there is room");
+            line.cut().await;
+            assert!(line.is_stream());
+            drop(received);
+        });
+    }
+}
