@@ -110,10 +110,8 @@ pub(crate) fn log(sink: &mut Sink, at_ns: u64, fact: &LogFact) {
 pub(crate) fn outcome(sink: &mut Sink, at_ns: u64, entry: &OutcomeEntry, names: &Names) {
     let Ticket { source, destination, correlation } = entry.ticket;
     let [from, to] = [source, destination].map(|tid| party(tid, names));
-    let (word, why) = match entry.outcome {
-        Outcome::Rejected(why) => ("Rejected".to_owned(), Some(why)),
-        other => (format!("{other:?}"), None),
-    };
+    let why = if let Outcome::Rejected(why) = entry.outcome { Some(why) } else { None };
+    let word = if why.is_some() { "Rejected".to_owned() } else { format!("{:?}", entry.outcome) };
     let reason = why.map_or_else(String::new, |why| format!(" ({why:?})"));
     let text = format!("message {correlation} from {} to {}: {word}{reason}", from.label(), to.label());
     let data = json!({
