@@ -186,13 +186,13 @@ impl<R: Read> Reader<R> {
         Some(format!(
             "{}: unfinished: the file ends at byte {at}, without its summary; messages after {} of it may be missing",
             self.path.display(),
-            self.offset(last_ns)
+            self.offset(last_ns, last_ns)
         ))
     }
 
-    /// Returns the time from the first message of the file, as text.
-    fn offset(&self, at_ns: u64) -> String {
-        let first_ns = self.times.map_or(at_ns, |(first_ns, _)| first_ns);
+    /// Returns the time from the first message of the file, as text. That is the one at `first_ns` if none was read yet.
+    fn offset(&self, at_ns: u64, first_ns: u64) -> String {
+        let first_ns = self.times.map_or(first_ns, |(first_ns, _)| first_ns);
         let offset = Duration::from_nanos(at_ns.saturating_sub(first_ns));
         // As the times of a replay are written.
         format!("{}.{:09}s", offset.as_secs(), offset.subsec_nanos())
@@ -314,7 +314,7 @@ impl<R: Read> Reader<R> {
     /// Returns the fault of a chunk, with the times that it states for its messages.
     fn damaged_chunk(&self, fault: &str) -> String {
         let times = chunk::times(self.frames.body()).map_or_else(String::new, |(first_ns, last_ns)| {
-            let [first, last] = [first_ns, last_ns].map(|at_ns| self.offset(at_ns));
+            let [first, last] = [first_ns, last_ns].map(|at_ns| self.offset(at_ns, first_ns));
             format!("; its messages, from {first} to {last} of the file, are missing")
         });
         format!("a chunk is damaged: {fault}{times}")

@@ -2,13 +2,17 @@
 
 use std::{collections::BTreeMap, fmt, time::Duration};
 
-use sinew_runtime::{tid::Tid, time::Time, wire::Kind};
+use sinew_runtime::{
+    tid::Tid,
+    time::Time,
+    wire::{Flags, Kind},
+};
 
 use crate::{TimedMessage, value::Value};
 
 /// Compares a recording with its replay: the messages of each source in their order, with destination,
-/// type, class, flags and every byte. Names the first difference. Use [`Comparison`] to compare times too, or
-/// to ignore a field.
+/// type, class, flags and every byte. The flag KEEP is not compared, since the node decides on it. Names the first
+/// difference. Use [`Comparison`] to compare times too, or to ignore a field.
 ///
 /// # Errors
 /// The first difference.
@@ -131,7 +135,8 @@ impl Comparison {
         if was.class != is.class {
             return differ("class", &format!("{:?}", was.class), &format!("{:?}", is.class));
         }
-        if was.flags != is.flags {
+        // A node removes KEEP from a value that it has no room for.
+        if was.flags.without(Flags::KEEP) != is.flags.without(Flags::KEEP) {
             return differ("flags", &format!("{:?}", was.flags), &format!("{:?}", is.flags));
         }
         if let Some(words) = self.payload(&was.payload, &is.payload) {

@@ -62,6 +62,7 @@
 //! | messages of the applications under test | outputs; among themselves they are also delivered, after [`Replay::latency`] |
 //! | timers, input watchdogs, expiry, deadlines of requests and confirmations, guards of outputs | virtual time |
 //! | `run_later`, `run_interval` and `notify_later` of actix | virtual time |
+//! | retained values | not there: a member that joins later gets none, and a removal is no output |
 //! | places, own processes, requirements, restarts, the watchdog of hung actors | not there: the applications start at once, and an end of one is an error |
 //! | threads, tasks, sockets and files of an application | real: they are outside of the lock-step |
 //!

@@ -182,6 +182,11 @@ impl MessageSink for World {
     /// Accepts a message of an application under test.
     fn submit(&self, mut message: Message) -> Result<(), SubmitError> {
         let (header, now) = (message.header, self.clock.now());
+        if header.flags.has(Flags::KEEP) && message.payload.is_empty() {
+            // As in a node, the removal of a retained value reaches no member and no recording. spec: FRAME-8.3
+            message.settle(Outcome::Delivered);
+            return Ok(());
+        }
         let destination = header.destination;
         let (receivers, late) = {
             let mut state = lock(&self.state);

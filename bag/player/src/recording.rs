@@ -43,7 +43,7 @@ pub enum RecordingError {
     NothingSent,
     /// All messages that could be read are the same, and others are damaged or missing.
     #[error(
-        "all {messages} messages that can be compared are the same, and the recording is not whole: {damage}; give a whole recording, or read it with an earlier end"
+        "all {messages} messages that can be compared are the same, and the recording is not whole: {damage}; give a whole recording, or, if only its end is missing, read it with an earlier end"
     )]
     NotWhole {
         /// The messages that were compared.

@@ -102,7 +102,7 @@ impl Ordered {
             }
         }
         let mut damage = damage.into_lines(path);
-        // What was missing before is missing now.
+        // Messages that the former files lack are missing here, too.
         let losses =
             metadata.get(MERGED).and_then(|fields: &BTreeMap<String, String>| fields.get(MERGED_LOSSES));
         let losses = losses.map_or("", String::as_str).lines().take(LOSSES_MAX);

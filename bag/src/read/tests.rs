@@ -5,7 +5,7 @@ use proptest::prelude::*;
 use super::*;
 use crate::{
     BagWriter, Compression, Options, Origin,
-    testing::{TestFolder, angle, record},
+    testing::{TestFolder, angle, chunks, record},
 };
 
 const SECOND: u64 = 1_000_000_000;
@@ -66,6 +66,33 @@ fn file_cut_anywhere_is_read_up_to_the_cut() {
         last = messages.len();
     }
     assert_eq!(last, whole.len(), "the summary is not needed");
+}
+
+#[test]
+fn damaged_first_chunk_is_named_with_its_times() {
+    let folder = TestFolder::new();
+    let path = folder.path("walk.mcap");
+    // Given: messages that are all in one chunk
+    let mut bag = BagWriter::create(&path, Options::default(), Origin::default()).unwrap();
+    let channel = angle(&mut bag, crate::Direction::Sent);
+    (1..=50).for_each(|number| bag.message(channel, &record(number, number * SECOND / 1_000)).unwrap());
+    bag.finish(SECOND / 10).unwrap();
+    let mut bytes = fs::read(&path).unwrap();
+    let times = |at: usize| chunk::times(&bytes[at + 9..]).unwrap();
+    // A chunk without messages states no times.
+    let first = chunks(&bytes).into_iter().find(|(at, _)| times(*at).1 > 0);
+    let (at, length) = first.expect("the file has messages");
+    let (first_ns, last_ns) = times(at);
+    assert!(first_ns < last_ns, "{first_ns} to {last_ns}");
+    bytes[at + 9 + length / 2] ^= 0x40;
+    let mut reader = Reader::new(Cursor::new(&bytes[..]), Path::new("some")).unwrap();
+    let fault = std::iter::repeat_with(|| reader.next_item().map(|item| item.is_some()))
+        .take_while(|item| !matches!(item, Ok(false)))
+        .find_map(Result::err);
+    let fault = fault.expect("the chunk is damaged").to_string();
+    let lasts = Duration::from_nanos(last_ns - first_ns);
+    let times = format!("from 0.000000000s to {}.{:09}s", lasts.as_secs(), lasts.subsec_nanos());
+    assert!(fault.contains(&times), "{times}: {fault}");
 }
 
 #[test]

@@ -287,7 +287,7 @@ fn part_of(id: &str, ring: &str, is_handed_out: bool) -> Part {
 }
 
 /// Returns whether one of the files of a span has the records of this ring: its node has started again, and has handed
-/// out what it froze before.
+/// out its former spans.
 fn has_ring(files: &[Converted], ring: &DeadRing) -> bool {
     files.iter().any(|file| file.origin == (ring.address, Some(ring.incarnation)))
 }
@@ -399,7 +399,11 @@ pub(super) fn ask_spans(system: &mut System, nodes: Vec<(NodeAddress, String)>) 
     let mut answers = system.ask_these::<AskFrozen, FrozenReport>(nodes);
     for answer in &mut answers {
         if answer.result.as_ref().is_ok_and(|report| report.refused.as_deref() == Some(FROZEN_BUSY)) {
-            answer.result = ask(system, answer.node, &AskFrozen::default()).map_err(|why| why.to_string());
+            answer.result = ask(system, answer.node, &AskFrozen::default()).map_err(|error| match error {
+                // The line of a node begins with its address.
+                SystemError::NoAnswer(_, why) => why,
+                error => error.to_string(),
+            });
         }
     }
     answers

@@ -39,8 +39,8 @@ pub(super) struct Retained {
     store: Store,
     /// The values, or their removals, that the queue to a node had no room for, with their classes.
     unsent: BTreeMap<(NodeAddress, Key), Class>,
-    /// The applications, with their groups, whose memberships are those of an incarnation that has ended. Their
-    /// next incarnation gets the values when it joins again. As many as there are memberships.
+    /// The memberships of incarnations that have ended: application and group. The next incarnation gets the values
+    /// when it joins again. At most as many as there are memberships.
     rejoining: BTreeSet<(AppAddress, AppAddress)>,
     not_kept: u64,
     not_handed_over: u64,
@@ -262,7 +262,7 @@ impl Router {
         }
     }
 
-    /// Removes the retained values of an application of this node, whose incarnation has ended. If it is still a
+    /// Removes the retained values of an application of this node after the end of its incarnation. If it is still a
     /// member of groups, its next incarnation gets their values when it joins again.
     pub fn forget_retained(&self, app: AppAddress) {
         let retained = &mut *lock(&self.retained);

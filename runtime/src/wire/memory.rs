@@ -174,8 +174,8 @@ struct Buffers {
 
 impl Buffers {
     /// Returns the initial bytes of memory for one payload. In a burst of payloads of one length, this is their
-    /// length, so that the memory does not have to grow. Of two lengths it is the smaller one: a short payload
-    /// never keeps memory for long ones.
+    /// length, so that the memory does not have to grow. Of two lengths it is the smaller one: of short payloads
+    /// behind long ones only the first keeps more memory than it needs, at most [`BUFFER_BYTES`].
     fn expected_length(&self) -> usize {
         self.alone[0].min(self.alone[1]).clamp(SHORT, BUFFER_BYTES)
     }

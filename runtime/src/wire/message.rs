@@ -47,7 +47,8 @@ pub trait Payload: Serialize + DeserializeOwned + Send + 'static {
     /// member that joins later ([`Delivery::is_retained`](crate::app::Delivery::is_retained)). It is removed at the end
     /// of its time to live and of its sender, and by
     /// [`Sender::clear_retained`](crate::sender::Sender::clear_retained). Such a type is not of class Stream and has no
-    /// `PROTECTION`, or it does not compile where it is sent. It is always sent to a group in its own class.
+    /// `PROTECTION`, or it does not compile where it is sent. It is always sent to a group in its own class. A message
+    /// to the members on one node alone is not retained, and leaves the retained value as it is.
     const RETAINED: bool = false;
     /// The treatment of messages from a sender with another version of this type, on another node or in another
     /// process. The receiver's type decides.
@@ -157,7 +158,8 @@ impl Message {
         }
         let mut header = Header::new(P::KIND, source, destination);
         header.class = P::CLASS;
-        if P::RETAINED && destination.app.is_group() {
+        // The members of one node alone are not the group, of which this is the last value.
+        if P::RETAINED && destination.node == NodeAddress::ALL && destination.app.is_group() {
             header.flags = Flags::KEEP;
         }
         if let Some(time) = P::TIME_TO_LIVE {
@@ -349,6 +351,10 @@ mod tests {
         let mut to_one = Message::typed(Tid::NONE, Tid::from_bits(0x1_0000_1000), &Mode(1)).header;
         assert_eq!((to_group.flags, to_one.flags), (Flags::KEEP, Flags::NONE));
         assert_eq!(Message::typed(Tid::NONE, group, &Point { x: 1.0 }).header.flags, Flags::NONE);
+        for node in [NodeAddress::HERE, NodeAddress::new(0x0a00_0001)] {
+            let of_one_node = Tid::new(node, group.app);
+            assert_eq!(Message::typed(Tid::NONE, of_one_node, &Mode(1)).header.flags, Flags::NONE);
+        }
         to_group.override_class(Class::Control);
         to_one.override_class(Class::Control);
         assert_eq!((to_group.class, to_one.class), (Class::Bulk, Class::Control));

@@ -10,7 +10,7 @@ payload!("retained.marker" => struct Marker;);
 
 const GROUP: &str = "modes";
 
-/// A node whose clients connect at `socket`.
+/// A node with its client socket at `socket`.
 fn node(loopback: &Loopback, name: &str, socket: &Path) -> NodeBuilder {
     let socket = socket.to_owned();
     loopback.node(name).configure(move |config| config.lncl.socket = Some(socket))

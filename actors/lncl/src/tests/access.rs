@@ -271,7 +271,7 @@ fn values_of_guests_are_not_retained() {
         message.header.flags = Flags::KEEP;
         message
     };
-    // Given: one of the robot's own, whose value is retained
+    // Given: one of the robot's own, with a retained value
     let (mut own, tid) = RawClient::register(&node, &named("gait"));
     own.send(&value(tid));
     assert_eq!(member.next().header.flags, Flags::KEEP);

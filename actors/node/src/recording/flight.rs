@@ -338,7 +338,7 @@ impl Flight {
             Err(_) => {}
         }
         // The end of the node may have removed them before they were written.
-        // SYNC: SeqCst, as in `remove_names`: either this thread sees the end, or the end sees the file.
+        // SYNC: SeqCst, as in `finish`: either this thread sees the end, or the end sees the file.
         if self.is_ending.load(Ordering::SeqCst) {
             self.remove_names(journal.path());
         }

@@ -1,10 +1,14 @@
 //! Requests and confirmed messages: answered from the inputs, by an application under test, or by nobody.
 
-use sinew::message::AskError;
+use sinew::{
+    message::AskError,
+    replay::{Flags, compare},
+};
 
 use super::*;
 
 payload!("replay.ask" => #[derive(Debug, Clone, Copy)] struct Ask { number: u32 });
+payload!("replay.mode", retained => #[derive(Debug, Clone, Copy)] struct Mode { is_walking: bool });
 payload!("replay.answer" => #[derive(Debug, Clone, Copy)] struct Answer { number: u32 });
 
 /// Asks the knee each 10 ms, and confirms a note to the motor once.
@@ -128,4 +132,44 @@ fn group_reaches_its_members_under_test() {
     let sources: Vec<_> = outputs.iter().map(|output| output.source).collect();
     assert_eq!(sources, [tid(HIP), tid(KNEE)]);
     assert_eq!(notes(&outputs), wanted([(3, "4"), (3, "4")]));
+}
+
+/// Sends a retained mode to a group, and removes it.
+struct Announcer;
+
+impl Actor for Announcer {
+    type Context = AppContext<Self>;
+
+    fn started(&mut self, ctx: &mut Self::Context) {
+        // By then the member has joined.
+        ctx.run_later(Duration::from_millis(1), |_, ctx| {
+            ctx.send(Tid::group("leg"), &Mode { is_walking: true }).unwrap();
+            ctx.clear_retained::<Mode>("leg").unwrap();
+        });
+    }
+}
+
+impl Handler<Delivery<Mode>> for Member {
+    type Result = ();
+
+    fn handle(&mut self, mode: Delivery<Mode>, ctx: &mut Self::Context) {
+        note(ctx, format!("is walking: {}", mode.is_walking));
+    }
+}
+
+#[test]
+fn removal_of_a_retained_value_is_no_message() {
+    let run = || {
+        let announcer = AppSpec::new("hip", || Announcer);
+        let member = AppSpec::new("knee", || Member).handles::<Mode>();
+        replay().app(announcer).app(member).ends_at(ms(9)).run([]).unwrap()
+    };
+    let outputs = run();
+    let sent: Vec<_> = outputs.iter().map(|output| (output.source, output.kind)).collect();
+    assert_eq!(sent, [(tid(HIP), Mode::KIND), (tid(KNEE), Note::KIND)]);
+    assert_eq!(notes(&outputs), wanted([(1, "is walking: true")]));
+    // And: a node that had no room for the value has recorded it without KEEP
+    let mut recorded = outputs.clone();
+    recorded[0].flags = Flags::NONE;
+    compare(&recorded, &outputs).expect("the application did the same");
 }
