@@ -187,10 +187,15 @@ impl Client {
         self.server.state.ctx.router.observe(self.tid, &passage, u64::from(*missed));
     }
 
-    /// Shows the outcome of a message that the client has sent on a direct link.
+    /// Shows the outcome of a message that the client has sent on a direct link. A client that no tap watches was not
+    /// asked to report, or has not received yet that it is not watched any more.
     fn observe_outcome(&self, observed: &Observed) {
         let Observed { missed, header, payload, .. } = observed;
-        self.server.state.ctx.router.observe_missed(self.tid, u64::from(*missed));
+        let router = &self.server.state.ctx.router;
+        if !router.is_observed(self.tid) {
+            return;
+        }
+        router.observe_missed(self.tid, u64::from(*missed));
         // A byte that is not assigned is no outcome.
         if let Some(outcome) = payload.first().and_then(|code| Outcome::from_code(*code)) {
             let Header { source: destination, correlation, .. } = *header;
