@@ -244,7 +244,7 @@ fn joined_copy_has_the_lost_records_of_former_ones() {
 }
 
 #[test]
-fn record_of_a_former_copy_is_not_read_from_the_source() {
+fn former_copy_is_preferred_to_the_source() {
     let folder = Folder::new("preferred");
     let [first, second, other, target] =
         ["first", "second", "other", "third"].map(|name| folder.0.join(name));

@@ -105,7 +105,7 @@ fn name_of_a_span_has_its_causes_in_order() {
 }
 
 #[test]
-fn flood_of_causes_leaves_room_for_the_words_of_a_later_span() {
+fn flood_leaves_room_for_the_words_of_later_causes() {
     let mut plan = plan(1);
     for number in 0..1_000 {
         let at_ns = 100 * SECOND + number * (SECOND / 100);
