@@ -216,7 +216,7 @@ fn end_of_a_check_is_that_of_its_messages() {
 }
 
 #[test]
-fn check_of_a_file_without_its_end_is_no_proof() {
+fn check_of_an_unfinished_file_is_no_proof() {
     let folder = TestFolder::new();
     let path = walk(&folder, 0.3);
     let bytes = fs::read(&path).unwrap();

@@ -130,7 +130,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn other_command_in_the_project_is_named_with_a_remedy() {
+    fn other_command_is_named_with_a_remedy() {
         let reason = "node address 127.0.83.119 is used already by 'sinew-play' at 127.0.0.1:7; give this node another \
                       `node.address`, or end the other one";
         let error = gave_up("replay", reason).to_string();

@@ -268,7 +268,7 @@ fn first_message_that_differs_is_named() {
 }
 
 #[test]
-fn check_of_a_file_that_is_cut_off_is_no_proof() {
+fn check_of_a_cut_file_is_no_proof() {
     let scenario = Scenario::new();
     let file = recorded(&scenario.directory, &[1, 2, 3]);
     let bytes = fs::read(&file).expect("it was written");

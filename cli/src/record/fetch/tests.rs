@@ -30,7 +30,7 @@ fn no_file_of_one_run_replaces_another() {
 }
 
 #[test]
-fn part_that_the_node_hands_out_is_not_written_again() {
+fn part_of_a_living_node_is_not_written_again() {
     let ring = |incarnation| DeadRing {
         path: "sinew-leg-0.0.0.1.journal".into(),
         name: "knee".to_owned(),
@@ -77,7 +77,7 @@ fn missing_edges_of_a_span_are_stated() {
 }
 
 #[test]
-fn node_that_ended_has_one_line_for_all_its_spans() {
+fn ended_node_has_one_line_for_its_spans() {
     let silent = |name: &str| Silent {
         name: name.to_owned(),
         why: "no answer within 1s".to_owned(),
