@@ -39,7 +39,7 @@ impl<T: ?Sized + 'static> Observers<T> {
         self.replace(Some(observer), None);
     }
 
-    /// Returns whether there is room for the next one, if there is one.
+    /// Removes `former`, and adds `next` if there is room. Returns whether there is.
     fn replace(&self, former: Option<&Arc<T>>, next: Option<&Arc<T>>) -> bool {
         let _change = lock(&self.change);
         let before = self.list.load();
