@@ -15,9 +15,9 @@ const OBSERVERS_MAX: usize = 64;
 /// The observers, some of which may have been dropped.
 pub(crate) struct Observers<T: ?Sized + 'static> {
     list: ArcSwapOption<Vec<Weak<T>>>,
-    /// Whether there ever was one. SYNC: Relaxed; the list has its own order, and an observer that is just being added
-    /// may miss an event.
-    was_used: AtomicBool,
+    /// Whether there may be one. SYNC: Relaxed; the list has its own order, and an observer that is just being added may
+    /// miss an event.
+    is_used: AtomicBool,
     /// Held while the list is replaced.
     change: Mutex<()>,
 }
@@ -25,12 +25,22 @@ pub(crate) struct Observers<T: ?Sized + 'static> {
 impl<T: ?Sized + 'static> Observers<T> {
     /// Creates an empty list.
     pub(crate) const fn new() -> Self {
-        Self { list: ArcSwapOption::const_empty(), was_used: AtomicBool::new(false), change: Mutex::new(()) }
+        Self { list: ArcSwapOption::const_empty(), is_used: AtomicBool::new(false), change: Mutex::new(()) }
     }
 
     /// Adds an observer for as long as it lives, in place of `former`: each event reaches one of the two. Returns
     /// `false` if there are too many; `former` is removed all the same.
     pub(crate) fn add(&self, observer: &Arc<T>, former: Option<&Arc<T>>) -> bool {
+        self.replace(former, Some(observer))
+    }
+
+    /// Removes an observer. Without any other one an event costs one load again.
+    pub(crate) fn remove(&self, observer: &Arc<T>) {
+        self.replace(Some(observer), None);
+    }
+
+    /// Removes `former`, and adds `next` if there is room. Returns whether there is.
+    fn replace(&self, former: Option<&Arc<T>>, next: Option<&Arc<T>>) -> bool {
         let _change = lock(&self.change);
         let before = self.list.load();
         let former = former.map(Arc::downgrade);
@@ -40,19 +50,17 @@ impl<T: ?Sized + 'static> Observers<T> {
         let mut observers: Vec<_> =
             before.iter().flat_map(|observers| observers.iter()).filter(stays).cloned().collect();
         let has_room = observers.len() < OBSERVERS_MAX;
-        if has_room {
-            observers.push(Arc::downgrade(observer));
-        }
+        observers.extend(next.filter(|_| has_room).map(Arc::downgrade));
+        self.is_used.store(!observers.is_empty(), Ordering::Relaxed);
         self.list.store(Some(Arc::new(observers)));
-        self.was_used.store(true, Ordering::Relaxed);
         has_room
     }
 
-    /// Calls each living observer. It never waits, also while an observer is added, which may miss this event. As long
-    /// as there was none it costs one load.
+    /// Calls each living observer. It never waits, also while an observer is added, which may miss this event. Without
+    /// any observer it costs one load.
     #[inline]
     pub(crate) fn each(&self, call: impl FnMut(&T)) {
-        if self.was_used.load(Ordering::Relaxed) {
+        if self.is_used.load(Ordering::Relaxed) {
             self.call(call);
         }
     }
@@ -91,6 +99,25 @@ mod tests {
         assert!(observers.add(&next, Some(&former)));
         events(&observers);
         assert_eq!([former.load(Ordering::Relaxed), next.load(Ordering::Relaxed)], [1, 1]);
+    }
+
+    #[test]
+    fn removed_observer_leaves_the_others_and_no_cost() {
+        let observers = Observers::new();
+        let [first, second] = [Arc::new(AtomicUsize::new(0)), Arc::new(AtomicUsize::new(0))];
+        assert!(observers.add(&first, None) && observers.add(&second, None));
+        observers.remove(&first);
+        events(&observers);
+        assert_eq!([first.load(Ordering::Relaxed), second.load(Ordering::Relaxed)], [0, 1]);
+        assert!(observers.is_used.load(Ordering::Relaxed));
+        observers.remove(&second);
+        events(&observers);
+        assert_eq!(second.load(Ordering::Relaxed), 1);
+        assert!(!observers.is_used.load(Ordering::Relaxed));
+        // And: a later one is called
+        assert!(observers.add(&first, None));
+        events(&observers);
+        assert_eq!(first.load(Ordering::Relaxed), 1);
     }
 
     #[test]

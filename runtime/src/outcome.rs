@@ -13,7 +13,7 @@ use serde::{Deserialize, Serialize};
 
 pub use self::{
     members::{MEMBERS_MAX, MemberOutcome, MemberReport, MemberState, MemberTable, REPORTS_MAX},
-    observer::{OutcomeObserver, observe, show, show_members},
+    observer::{OutcomeObserver, observe, show, show_members, stop_observing},
 };
 use crate::tid::{AppAddress, NodeAddress, Tid};
 

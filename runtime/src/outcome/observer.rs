@@ -24,6 +24,11 @@ pub fn observe(observer: &Arc<dyn OutcomeObserver>, former: Option<&Arc<dyn Outc
     OBSERVERS.add(observer, former)
 }
 
+/// Removes an observer. An outcome that another thread is just showing may still reach it.
+pub fn stop_observing(observer: &Arc<dyn OutcomeObserver>) {
+    OBSERVERS.remove(observer);
+}
+
 /// Shows the outcome of a message to all observers. Without any observer it costs one load.
 #[inline]
 pub fn show(ticket: Ticket, outcome: Outcome) {
@@ -81,6 +86,8 @@ mod tests {
         pending.members(ticket, &[MemberReport::of_member(member, MemberState::Pending)]);
         pending.members(ticket, &[MemberReport::of_member(member, MemberState::Settled(full))]);
         pending.settle(ticket, Outcome::Delivered);
+        stop_observing(&observer);
+        show(ticket, Outcome::Unknown);
         assert_eq!(*lock(&notes.0), [(member, full), (drives, Outcome::Delivered)]);
     }
 }

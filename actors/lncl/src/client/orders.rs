@@ -147,7 +147,7 @@ impl Client {
     fn switch(&self, to: Tid, number: u64, correlation: u64) {
         let to = self.server.state.ctx.router.absolute(to);
         let ticket = Ticket { source: self.tid, destination: to, correlation };
-        let Some(receipt) = self.outcomes.receipt(ticket) else { return };
+        let Some(receipt) = self.outcomes.question_receipt(ticket) else { return };
         // Marks bypass the access list on their way into the peer's queues. A client without links has none to switch
         // to.
         if self.server.state.security.access.get().is_some() {
@@ -187,10 +187,15 @@ impl Client {
         self.server.state.ctx.router.observe(self.tid, &passage, u64::from(*missed));
     }
 
-    /// Shows the outcome of a message that the client has sent on a direct link.
+    /// Shows the outcome of a message that the client has sent on a direct link. A client that no tap watches was not
+    /// asked to report, or has not received yet that it is not watched any more.
     fn observe_outcome(&self, observed: &Observed) {
         let Observed { missed, header, payload, .. } = observed;
-        self.server.state.ctx.router.observe_missed(self.tid, u64::from(*missed));
+        let router = &self.server.state.ctx.router;
+        if !router.is_observed(self.tid) {
+            return;
+        }
+        router.observe_missed(self.tid, u64::from(*missed));
         // A byte that is not assigned is no outcome.
         if let Some(outcome) = payload.first().and_then(|code| Outcome::from_code(*code)) {
             let Header { source: destination, correlation, .. } = *header;
@@ -205,7 +210,8 @@ impl Client {
         let now = Time::now();
         self.server.refusals.count(now, cause, &detail);
         if flags.has(Flags::CONFIRM) {
-            self.send_outcome(destination, correlation, Outcome::Rejected(why));
+            let ticket = Ticket { source: self.tid, destination, correlation };
+            self.outcomes.send(ticket, Outcome::Rejected(why));
         } else {
             // The message may name another source, but this client sent it.
             let destination = self.server.state.ctx.router.absolute(destination);
@@ -221,8 +227,9 @@ impl Client {
         self.server.refusals.count(Time::now(), "membership", &detail);
     }
 
+    /// Notifies the client of the outcome of a question that is no message: no observer gets it.
     pub(super) fn send_outcome(&self, about: Tid, correlation: u64, outcome: Outcome) {
         let ticket = Ticket { source: self.tid, destination: about, correlation };
-        self.outcomes.send(ticket, outcome);
+        self.outcomes.answer(Message::outcome(ticket, outcome));
     }
 }

@@ -50,13 +50,30 @@ impl Outcomes {
     /// Returns the receipt of a message of the client. If too many are without an outcome, notifies the client and
     /// returns `None`.
     pub(super) fn receipt(self: &Arc<Self>, ticket: Ticket) -> Option<Receipt> {
-        // Only the reader of the client adds to them.
-        if self.pending.load(Ordering::Relaxed) >= self.pending_max {
+        if !self.take_place() {
             self.send(ticket, Outcome::Rejected(Rejection::QueueFull));
             return None;
         }
-        self.pending.fetch_add(1, Ordering::Relaxed);
         Some(Receipt::new(self.clone(), ticket))
+    }
+
+    /// Same as [`receipt`](Self::receipt), for a question that is no message: no observer gets its outcome.
+    pub(super) fn question_receipt(self: &Arc<Self>, ticket: Ticket) -> Option<Receipt> {
+        if !self.take_place() {
+            self.answer(Message::outcome(ticket, Outcome::Rejected(Rejection::QueueFull)));
+            return None;
+        }
+        Some(Receipt::new(Arc::new(Questions(self.clone())), ticket))
+    }
+
+    /// Counts one more message without an outcome, if there is room.
+    fn take_place(&self) -> bool {
+        // Only the reader of the client adds to them.
+        let has_room = self.pending.load(Ordering::Relaxed) < self.pending_max;
+        if has_room {
+            self.pending.fetch_add(1, Ordering::Relaxed);
+        }
+        has_room
     }
 
     /// Notifies the client of the outcome of a message.
@@ -111,5 +128,15 @@ impl ReceiptSink for Outcomes {
     fn members(&self, ticket: Ticket, reports: &[MemberReport]) {
         outcome::show_members(ticket, reports);
         Message::members(ticket, reports, self.payload_max).for_each(|frame| self.answer(frame));
+    }
+}
+
+/// The sink of questions of a client that are no messages.
+struct Questions(Arc<Outcomes>);
+
+impl ReceiptSink for Questions {
+    fn settle(&self, ticket: Ticket, outcome: Outcome) {
+        self.0.pending.fetch_sub(1, Ordering::Relaxed);
+        self.0.answer(Message::outcome(ticket, outcome));
     }
 }

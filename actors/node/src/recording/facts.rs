@@ -17,6 +17,7 @@ use sinew_runtime::{
 };
 use sinew_shm::journal::Journal;
 
+use super::plan::Trigger;
 use crate::NodeState;
 
 /// Time between two records of the clocks.
@@ -36,6 +37,13 @@ pub(super) struct KnownFacts {
 /// Writes a fact.
 pub(super) fn write<F: Fact>(journal: &Journal, node: NodeAddress, now: Time, of: &F) {
     journal.write(Channel::of_node(node, F::FORM).key(), now.as_nanos(), &[&fact(of)]);
+}
+
+/// Writes the trigger into the journal, so that it is an event of the span.
+pub(super) fn write_trigger(state: &NodeState, journal: &Journal, trigger: &Trigger) {
+    let (id, cause) = (trigger.id.to_string(), trigger.cause.as_str().to_owned());
+    let fact = NodeFact::Triggered { id, cause, bound_ns: trigger.bound_ns };
+    write(journal, state.ctx.node, Time::from_nanos(trigger.at_ns), &fact);
 }
 
 /// Writes each event of the process's log, and each restart.

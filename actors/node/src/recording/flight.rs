@@ -19,7 +19,7 @@ use std::{
 
 use rustix::fs::{Access, access};
 use sinew_model::thread_priority::lower_priority;
-use sinew_record::{FrozenFacts, FrozenSpan, NodeFact, RecordReport};
+use sinew_record::{FrozenFacts, FrozenSpan, RecordReport};
 use sinew_runtime::{
     incident::{self, IncidentKind, IncidentObserver},
     lock, log,
@@ -28,7 +28,7 @@ use sinew_runtime::{
 use sinew_shm::journal::Journal;
 
 use super::{
-    facts::{self, Changes},
+    facts::{Changes, write_trigger},
     names::names_for_reader,
     plan::{FreezePlan, Output, SpanOrder, Trigger, TriggerId},
     store::{FrozenError, FrozenStore, move_ring, read_facts, write_facts},
@@ -240,7 +240,7 @@ impl Flight {
         self.take_causes(now, &changes.losses);
         self.write_names(state, journal, now, changes.has_new_names);
         let send = |trigger: &Trigger| {
-            note(state, journal, trigger);
+            write_trigger(state, journal, trigger);
             forward(state, trigger);
         };
         while self.poll(now.as_nanos(), send) {}
@@ -423,7 +423,7 @@ impl Flight {
             return;
         }
         // Its links have ended.
-        while self.poll(u64::MAX, |trigger| note(node, journal, trigger)) {}
+        while self.poll(u64::MAX, |trigger| write_trigger(node, journal, trigger)) {}
         if let Err(error) = self.start_work(&Weak::new(), journal.path()) {
             // There is no further turn: nothing waits for these spans.
             let lost = std::mem::take(&mut lock(&self.work).orders).len();
@@ -492,13 +492,6 @@ impl Drop for Running<'_> {
             self.0.idle.notify_all();
         }
     }
-}
-
-/// Writes the trigger into the journal, so that it is an event of the span.
-fn note(state: &NodeState, journal: &Journal, trigger: &Trigger) {
-    let (id, cause) = (trigger.id.to_string(), trigger.cause.as_str().to_owned());
-    let fact = NodeFact::Triggered { id, cause, bound_ns: trigger.bound_ns };
-    facts::write(journal, state.ctx.node, Time::from_nanos(trigger.at_ns), &fact);
 }
 
 #[cfg(test)]

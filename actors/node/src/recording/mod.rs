@@ -262,9 +262,8 @@ impl Recording {
             state.programs.clear();
             (state.active.take(), state.configured.take().is_some())
         };
-        let Some(mut active) = active else { return Ending::default() };
-        install(node, None);
-        active.outcomes = None;
+        let Some(active) = active else { return Ending::default() };
+        active.remove_taps(node);
         let flight = self.flight().cloned();
         if let Some(flight) = &flight {
             flight.finish(node, &active.journal);
@@ -332,7 +331,7 @@ impl Recording {
     }
 
     fn remove(&self, node: &NodeState, active: &Active) {
-        install(node, None);
+        active.remove_taps(node);
         active.journal.remove();
         self.ended.notify_all();
     }
@@ -393,6 +392,12 @@ impl KnownNames {
 }
 
 impl Active {
+    /// Ends the recording of messages and outcomes.
+    fn remove_taps(&self, node: &NodeState) {
+        install(node, None);
+        self.outcomes.iter().for_each(outcome::stop_observing);
+    }
+
     /// Replaces the tap if the selected names have other addresses now.
     fn refresh(&mut self, node: &NodeState, names: &KnownNames) {
         let chosen = if self.selection.is_all() {

@@ -30,8 +30,11 @@ const MEMORY_NS: u64 = 30_000_000_000;
 const FUTURE_NS: u64 = 1_000_000_000;
 /// Maximum number of known triggers. Further ones are counted.
 const TRIGGERS_MAX: usize = 256;
-/// Maximum number of causes without a trigger of which the words are kept. Further ones are counted.
-const COVERED_MAX: usize = 64;
+/// Maximum number of causes without a trigger of which the words are kept: enough for a flood of 30 s.
+const COVERED_MAX: usize = 512;
+/// Maximum number of these within `after` of one another. Further ones are counted: a flood must not take the room for
+/// the words of a later span.
+const COVERED_NEAR_MAX: usize = 16;
 /// Maximum number of causes that the name of a span has. Further ones are counted in it.
 const NAMED_MAX: usize = 8;
 /// Limits of the times in a trigger: those of the configuration.
@@ -263,13 +266,15 @@ impl FreezePlan {
         let is_named = self.known.values().any(|trigger| trigger.covers(at_ns) && is_same(&trigger.cause));
         // A name has each text once. That of an earlier group counts for itself.
         let after_ns = nanos(self.after);
-        let is_kept = |other: &CoveredCause| is_same(&other.cause) && at_ns.abs_diff(other.at_ns) <= after_ns;
-        if is_named || self.covered.iter().any(is_kept) {
+        let has_room = self.covered.len() < COVERED_MAX;
+        let is_near = |other: &&mut CoveredCause| at_ns.abs_diff(other.at_ns) <= after_ns;
+        let mut near: Vec<_> = self.covered.iter_mut().filter(is_near).collect();
+        if is_named || near.iter().any(|other| is_same(&other.cause)) {
             return;
         }
-        if self.covered.len() < COVERED_MAX {
+        if near.len() < COVERED_NEAR_MAX && has_room {
             self.covered.push(CoveredCause { at_ns, cause, further: 0 });
-        } else if let Some(last) = self.covered.last_mut() {
+        } else if let Some(last) = near.last_mut() {
             last.further += 1;
         }
     }

@@ -1,7 +1,6 @@
 //! Copies a span of a journal into a smaller journal, while the writers continue.
 
 use std::{
-    collections::BTreeMap,
     io,
     ops::RangeInclusive,
     path::{Path, PathBuf},
@@ -77,8 +76,10 @@ pub fn copy_span(
     copy_joined(&[], source, target, span)
 }
 
-/// Same as [`copy_span`], with the records that the source has lost and former copies of it still have. The copies are
-/// in the order of their times. One that cannot be read is left out.
+/// Same as [`copy_span`], with the records of former copies of the source, which may have lost them. A former copy that
+/// cannot be read is left out.
+///
+/// A record that both have is copied from the former copy: the source loses further records meanwhile.
 ///
 /// # Errors
 /// As [`copy_span`].
@@ -88,7 +89,16 @@ pub fn copy_joined(
     target: &Path,
     span: &RangeInclusive<u64>,
 ) -> Result<Copied, CopyJournalError> {
-    let Parts { parts, bytes, longest } = Parts::measure(former, source, span)?;
+    let parts = parts(former, source, span)?;
+    let (mut bytes, mut longest) = (0_u64, 0_u64);
+    for Part { path, times } in &parts {
+        each_record::<ReadJournalError>(path, times, |_, payload| {
+            let length = record_bytes(payload.len());
+            bytes = bytes.saturating_add(length);
+            longest = longest.max(length);
+            Ok(())
+        })?;
+    }
     // The longest record fits into a quarter of the ring.
     let ring_bytes = bytes.max(longest.saturating_mul(4)).clamp(RING_MIN, RING_MAX).next_power_of_two();
     let reader = JournalReader::open(source, Start::Newest)?;
@@ -112,9 +122,9 @@ pub fn copy_joined(
         file.put(0, &page).map_err(failed)?;
         file.put(WALL_OFFSET_AT, &wall_offset.to_ne_bytes()).map_err(failed)?;
         let mut ring = Ring { file, salt: header.salt, room: ring_bytes, position: 0, waiting: Vec::new() };
-        for (Part { path, .. }, at) in parts.iter().zip(1_usize..) {
-            each_record::<CopyJournalError>(path, span, |record, payload| {
-                if !has(&parts[at..], record) && ring.push(record, payload).map_err(failed)? {
+        for Part { path, times } in &parts {
+            each_record::<CopyJournalError>(path, times, |record, payload| {
+                if ring.push(record, payload).map_err(failed)? {
                     copied.add(record.time);
                 }
                 Ok(())
@@ -131,61 +141,52 @@ pub fn copy_joined(
     Ok(copied)
 }
 
-/// One of the journals that are copied.
+/// The records of one journal that are copied.
 struct Part<'a> {
     path: &'a Path,
-    /// First and last number of each place, within the span.
-    numbers: BTreeMap<u16, (u64, u64)>,
+    times: RangeInclusive<u64>,
 }
 
-/// The journals that are copied, the source as the last one, and the size of their records without repeated ones.
-struct Parts<'a> {
-    parts: Vec<Part<'a>>,
-    bytes: u64,
-    longest: u64,
-}
-
-impl<'a> Parts<'a> {
-    fn measure(
-        former: &'a [PathBuf],
-        source: &'a Path,
-        span: &RangeInclusive<u64>,
-    ) -> Result<Self, ReadJournalError> {
-        let mut all = Self { parts: Vec::new(), bytes: 0, longest: 0 };
-        all.add(source, span)?;
-        for path in former.iter().rev() {
-            // It has nothing to keep then.
-            let _ = all.add(path, span);
+/// Returns the parts of a copy, in the order of their times. No time is in two of them, so no record is copied twice: a
+/// record has the same time in all these journals.
+fn parts<'a>(
+    former: &'a [PathBuf],
+    source: &'a Path,
+    span: &RangeInclusive<u64>,
+) -> Result<Vec<Part<'a>>, ReadJournalError> {
+    // One that cannot be read, or has no record of the span, has nothing to keep.
+    let times = |path: &'a PathBuf| Some((times_in(path, span).ok()??, path));
+    let mut kept: Vec<_> = former.iter().filter_map(times).collect();
+    kept.sort_unstable();
+    // Earlier times are not read from the source: it may have lost their records.
+    let oldest =
+        if kept.is_empty() { Some(*span.start()) } else { times_in(source, span)?.map(|times| times.0) };
+    let from_source = |times: RangeInclusive<u64>| {
+        let has_some = !times.is_empty() && oldest.is_some_and(|oldest| oldest <= *times.end());
+        has_some.then_some(Part { path: source, times })
+    };
+    let (mut parts, mut next) = (Vec::new(), Some(*span.start()));
+    for ((first, last), path) in kept {
+        let Some(begin) = next.filter(|begin| *begin <= last) else { continue };
+        if begin < first {
+            parts.extend(from_source(begin..=first - 1));
         }
-        Ok(all)
+        parts.push(Part { path, times: begin.max(first)..=last });
+        next = last.checked_add(1);
     }
-
-    /// Adds a journal in front of the others.
-    fn add(&mut self, path: &'a Path, span: &RangeInclusive<u64>) -> Result<(), ReadJournalError> {
-        let (mut bytes, mut longest, mut numbers) = (0_u64, 0, BTreeMap::new());
-        each_record::<ReadJournalError>(path, span, |record, payload| {
-            let (first, last) = numbers.entry(record.place).or_insert((record.number, record.number));
-            (*first, *last) = ((*first).min(record.number), (*last).max(record.number));
-            if !has(&self.parts, record) {
-                let length = record_bytes(payload.len());
-                bytes = bytes.saturating_add(length);
-                longest = longest.max(length);
-            }
-            Ok(())
-        })?;
-        self.bytes = self.bytes.saturating_add(bytes);
-        self.longest = self.longest.max(longest);
-        self.parts.insert(0, Part { path, numbers });
-        Ok(())
-    }
+    parts.extend(next.and_then(|begin| from_source(begin..=*span.end())));
+    Ok(parts)
 }
 
-/// Returns whether one of these journals has the record.
-fn has(parts: &[Part<'_>], record: &Record) -> bool {
-    parts.iter().any(|part| {
-        let numbers = part.numbers.get(&record.place);
-        numbers.is_some_and(|(first, last)| (*first..=*last).contains(&record.number))
-    })
+/// Returns the earliest and the latest time of a record within `span`, if there is one.
+fn times_in(path: &Path, span: &RangeInclusive<u64>) -> Result<Option<(u64, u64)>, ReadJournalError> {
+    let mut times = None;
+    each_record::<ReadJournalError>(path, span, |record, _| {
+        let (first, last) = times.unwrap_or((record.time, record.time));
+        times = Some((first.min(record.time), last.max(record.time)));
+        Ok(())
+    })?;
+    Ok(times)
 }
 
 /// The ring of a copy. Its records lie one after the other, from its start.

@@ -244,6 +244,34 @@ fn joined_copy_has_the_lost_records_of_former_ones() {
 }
 
 #[test]
+fn former_copy_is_preferred_to_the_source() {
+    let folder = Folder::new("preferred");
+    let [first, second, other, target] =
+        ["first", "second", "other", "third"].map(|name| folder.0.join(name));
+    let write = |journal: &Journal, payload: &[u8]| {
+        (1..=30).for_each(|time| assert!(journal.write(KEY, time, &[payload])));
+    };
+    // Given: another payload in the former copies than in the source, which has all records
+    write(&Journal::create(&other, &small()).unwrap(), b"former");
+    copy_span(&other, &first, &(5..=10)).unwrap();
+    copy_span(&other, &second, &(20..=25)).unwrap();
+    let journal = Journal::create(&folder.path(), &small()).unwrap();
+    write(&journal, b"source");
+    // When
+    let copied = copy_joined(&[second, first], &folder.path(), &target, &(3..=28)).unwrap();
+    // Then
+    let mut reader = JournalReader::open(&target, Start::Oldest).unwrap();
+    let (mut payload, mut found) = (Vec::new(), Vec::new());
+    while let Some(record) = reader.next(0, &mut payload).unwrap() {
+        let is_former = (5..=10).contains(&record.time) || (20..=25).contains(&record.time);
+        assert_eq!(payload, if is_former { b"former" } else { b"source" }, "{}", record.time);
+        found.push(record.time);
+    }
+    assert_eq!(found, (3..=28).collect::<Vec<_>>(), "each once, in their order");
+    assert_eq!((copied.records, copied.first, copied.last), (26, 3, 28));
+}
+
+#[test]
 fn longest_record_has_room_in_a_copy() {
     let folder = Folder::new("longest");
     let target = folder.0.join("knee.frozen");

@@ -6,7 +6,7 @@ use sinew_runtime::{
     lock,
     outcome::{self, Outcome, OutcomeObserver, Ticket},
     router::tap::{Passage, Tap, TapOf, Way},
-    tid::Tid,
+    tid::{AppAddress, Tid},
     wire::{Header, Kind},
 };
 
@@ -103,17 +103,25 @@ impl OutcomeObserver for Outcomes {
     }
 }
 
+/// Returns an endpoint with an address that no other test of this process has, and the outcomes of its messages.
+fn with_outcomes(node: &TestNode, index: u32) -> (Endpoint, Arc<Outcomes>) {
+    let address = AppAddress::fixed(index).expect("it is one");
+    let endpoint = register(node, with_links().fixed_address(address));
+    let outcomes = Arc::new(Outcomes { source: endpoint.tid(), seen: std::sync::Mutex::default() });
+    let observer: Arc<dyn OutcomeObserver> = outcomes.clone();
+    assert!(outcome::observe(&observer, None));
+    (endpoint, outcomes)
+}
+
 #[test]
 fn observed_endpoint_reports_outcomes_on_its_links() {
     let node = TestNode::start();
-    let (mut one, mut other) = (endpoint(&node), endpoint(&node));
+    let ((mut one, outcomes), mut other) = (with_outcomes(&node, 0x770), endpoint(&node));
     link(&mut one, &mut other);
+    assert!(lock(&outcomes.seen).is_empty(), "those of the link's setup are no messages'");
     let notes = Arc::new(Notes { app: one.tid(), seen: std::sync::Mutex::default() });
     node.router().set_tap(TapOf::Recording, Some(notes.clone()));
     node.state.observed_links.observe(node.router());
-    let outcomes = Arc::new(Outcomes { source: one.tid(), seen: std::sync::Mutex::default() });
-    let observer: Arc<dyn OutcomeObserver> = outcomes.clone();
-    assert!(outcome::observe(&observer, None));
     let deadline = Time::now() + WATCHDOG;
     while !one.direct.is_observed() {
         assert!(Time::now() < deadline, "waited for the order to report");
@@ -125,11 +133,36 @@ fn observed_endpoint_reports_outcomes_on_its_links() {
         other.receive(WATCHDOG).unwrap().expect("a message").settle(Outcome::Failed);
         assert_eq!(sending.join().unwrap(), Outcome::Failed);
     });
-    // Applications of other tests have the same addresses.
-    while !lock(&outcomes.seen).contains(&(other.tid(), Outcome::Failed)) {
+    while lock(&outcomes.seen).is_empty() {
         assert!(Time::now() < deadline, "waited for the report of the outcome");
         thread::yield_now();
     }
+    assert_eq!(*lock(&outcomes.seen), [(other.tid(), Outcome::Failed)]);
+}
+
+// spec: LNCL-20
+#[test]
+fn outcome_is_not_shown_unless_its_client_is_observed() {
+    let node = TestNode::start();
+    let ((mut one, outcomes), other) = (with_outcomes(&node, 0x771), endpoint(&node));
+    let header = Header { correlation: 7, ..Header::new(Kind::OUTCOME, other.tid(), one.tid()) };
+    let mut report = |payload: &[u8]| {
+        let observed = sinew_protocol::observed::Observed::of(&header, payload, false);
+        one.node.writer.write(&observed.frame(one.tid())).unwrap();
+        // A round trip through the node comes behind the report.
+        assert_eq!(one.resolve("nobody", WATCHDOG).unwrap(), None);
+    };
+    // Given: a client that reports although nothing is recorded
+    report(&[Outcome::Failed.code()]);
+    assert!(lock(&outcomes.seen).is_empty());
+    // When
+    let notes = Arc::new(Notes { app: header.destination, seen: std::sync::Mutex::default() });
+    node.router().set_tap(TapOf::Recording, Some(notes));
+    [&b""[..], &[15], &[Outcome::Expired.code()]].into_iter().for_each(&mut report);
+    node.router().set_tap(TapOf::Recording, None);
+    report(&[Outcome::Failed.code()]);
+    // Then: bytes that are no outcome are none
+    assert_eq!(*lock(&outcomes.seen), [(header.source, Outcome::Expired)]);
 }
 
 // spec: LNCL-20

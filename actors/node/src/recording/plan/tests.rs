@@ -96,12 +96,29 @@ fn name_of_a_span_has_its_causes_in_order() {
     for number in 0..100 {
         plan.happened(at_ns, at_ns + number, &format!("fault {number}")).unwrap();
     }
-    assert_eq!(plan.covered.len(), COVERED_MAX);
+    assert_eq!(plan.covered.len(), COVERED_NEAR_MAX);
     let later = plan.poll(at_ns).is_some().then(|| drain(&mut plan, at_ns + 10 * SECOND)).unwrap();
     let Some(Output::Freeze(order)) = later.last() else { panic!("it is due: {later:?}") };
     assert!(
         order.causes.starts_with("fault 0; fault 1; ") && order.causes.ends_with("; fault 7; and 92 more")
     );
+}
+
+#[test]
+fn flood_leaves_room_for_the_words_of_later_causes() {
+    let mut plan = plan(1);
+    for number in 0..1_000 {
+        let at_ns = 100 * SECOND + number * (SECOND / 100);
+        plan.happened(at_ns, at_ns, &format!("fault {number}")).unwrap();
+    }
+    let at_ns = 115 * SECOND;
+    for cause in ["a guard is shut", "the knee is lost"] {
+        plan.happened(at_ns, at_ns, cause).unwrap();
+    }
+    assert!(plan.covered.len() <= COVERED_MAX);
+    let outputs = drain(&mut plan, 120 * SECOND);
+    let Some(Output::Freeze(order)) = outputs.last() else { panic!("it is due: {outputs:?}") };
+    assert_eq!(order.causes, "a guard is shut; the knee is lost");
 }
 
 #[test]
