@@ -182,6 +182,7 @@ pub(crate) fn wall_offset_s() -> f64 {
 }
 
 /// Returns the seconds of the wall clock.
+#[expect(clippy::disallowed_methods, reason = "people compare the times of a plot with a clock on the wall")]
 pub(crate) fn wall_s() -> f64 {
     let since = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH);
     // A clock before 1970 is not set.

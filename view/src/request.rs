@@ -126,7 +126,7 @@ pub(crate) fn document(head: Head<'_>, access: Access<'_>) -> Result<Document, R
         }
         "/api/parameters" if *head.method == Method::POST => {
             check_site(head.headers, &host, true)?;
-            if !head.headers.get(CONTENT_TYPE).is_some_and(|found| found == "application/json") {
+            if head.headers.get(CONTENT_TYPE).is_none_or(|found| found != "application/json") {
                 return Err(RequestError::NoJson);
             }
             Ok(Document::Set)
