@@ -95,8 +95,8 @@ impl EventLog {
     }
 
     /// Adds an event of this program, such as a set of parameters.
-    pub(crate) fn write(&mut self, wall_ms: u64, subject: String, text: String, is_fine: bool) {
-        self.push(wall_ms, &("write", subject), text, is_fine);
+    pub(crate) fn write(&mut self, wall_ms: u64, subject: &str, text: String, is_fine: bool) {
+        self.push(wall_ms, &("write", bounded(subject)), text, is_fine);
     }
 
     /// Returns the events after this number that are still kept.
@@ -250,11 +250,11 @@ mod tests {
     fn events_have_a_bound_and_numbers_without_gaps() {
         let mut log = EventLog::default();
         for number in 0..EVENTS_MAX as u64 + 3 {
-            log.write(number, "knee".to_owned(), "x".repeat(2 * TEXT_MAX), true);
+            log.write(number, &"knee".repeat(TEXT_MAX), "x".repeat(2 * TEXT_MAX), true);
         }
         let events = log.after(0);
         assert_eq!((events.len(), events[0].number), (EVENTS_MAX, 4));
-        assert!(events.iter().all(|event| event.text.len() == TEXT_MAX));
+        assert!(events.iter().all(|event| event.text.len() == TEXT_MAX && event.subject.len() < TEXT_MAX));
         assert_eq!(log.after(EVENTS_MAX as u64 + 2).len(), 1);
     }
 }
