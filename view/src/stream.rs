@@ -17,14 +17,7 @@ use tokio::{
     time::{sleep, timeout},
 };
 
-use crate::{
-    answer::Shared,
-    body::event,
-    cache::PAGE_FRESH,
-    look::Look,
-    model,
-    pages::{PageGuard, wall_s},
-};
+use crate::{answer::Shared, body::event, cache::PAGE_FRESH, look::Look, model, pages::wall_s};
 
 /// Events that wait for a page.
 const WAITING_MAX: usize = 8;
@@ -57,7 +50,13 @@ pub(crate) fn open(shared: &Arc<Shared>, line: &Arc<Line>, look: Look) -> Option
     line.is_stream.store(true, Ordering::Relaxed);
     let (shared, line) = (Arc::clone(shared), Arc::clone(line));
     tokio::spawn(async move {
-        if send_states(&shared, &events, guard).await == End::Stuck {
+        // A page that has gone ends it at once, also while the nodes are asked.
+        let end = tokio::select! {
+            end = send_states(&shared, &events) => end,
+            () = events.closed() => End::Closed,
+        };
+        drop(guard);
+        if end == End::Stuck {
             line.cut.notify_one();
         }
     });
@@ -73,7 +72,7 @@ enum End {
     Stuck,
 }
 
-async fn send_states(shared: &Shared, events: &Sender<Bytes>, _guard: PageGuard) -> End {
+async fn send_states(shared: &Shared, events: &Sender<Bytes>) -> End {
     let mut last = 0;
     loop {
         let Some(snapshot) = shared.cache.snapshot(PAGE_FRESH).await else { return End::Closed };
@@ -102,25 +101,31 @@ async fn send_states(shared: &Shared, events: &Sender<Bytes>, _guard: PageGuard)
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{cache::Cache, events::EventLog, pages::Pages, source::NoSystem};
-
-    fn shared() -> Shared {
-        let source: Arc<dyn crate::source::Source> = Arc::new(NoSystem);
-        let cache = Cache::start(Arc::clone(&source), Duration::ZERO).expect("a thread");
-        let pages = Pages::start(Arc::clone(&source)).expect("a thread");
-        Shared::new(source, cache, pages, EventLog::default())
-    }
 
     #[test]
     fn page_that_reads_nothing_is_cut_off() {
         let runtime = tokio::runtime::Builder::new_current_thread().enable_time().start_paused(true).build();
         runtime.expect("a runtime").block_on(async {
-            let shared = Arc::new(shared());
+            let shared = Shared::without_system();
             let line = Arc::new(Line::default());
             let received = open(&shared, &line, Look::default()).expect("there is room");
             line.cut().await;
             assert!(line.is_stream());
             drop(received);
+        });
+    }
+
+    #[test]
+    fn page_that_has_gone_gives_its_place_back() {
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_time().start_paused(true).build();
+        runtime.expect("a runtime").block_on(async {
+            let shared = Shared::without_system();
+            let open = || open(&shared, &Arc::new(Line::default()), Look::default());
+            let mut pages: Vec<_> = std::iter::from_fn(open).collect();
+            assert!(pages.pop().is_some() && open().is_none());
+            // No snapshot comes before this: only the other tasks run.
+            tokio::task::yield_now().await;
+            assert!(open().is_some());
         });
     }
 }
