@@ -43,6 +43,8 @@ pub(super) struct Messages {
     apps: BTreeSet<String>,
     /// The applications that were found.
     found: BTreeMap<String, Tid>,
+    /// Their addresses.
+    read: BTreeSet<Tid>,
     /// Applications that were not found, and nodes that refuse, with the reason.
     faults: BTreeMap<String, String>,
     resolve_due: Time,
@@ -95,6 +97,7 @@ impl Messages {
             system: None,
             apps: BTreeSet::new(),
             found: BTreeMap::new(),
+            read: BTreeSet::new(),
             faults: BTreeMap::new(),
             resolve_due: now,
             watch_due: now,
@@ -116,7 +119,8 @@ impl Messages {
             self.entry.leave(system);
             return Err(why);
         }
-        let nodes: BTreeSet<_> = self.found.values().map(|tid| tid.node).collect();
+        self.read = self.found.values().copied().collect();
+        let nodes: BTreeSet<_> = self.read.iter().map(|tid| tid.node).collect();
         self.journals.retain(|node, _| nodes.contains(node));
         self.others.retain(|node| nodes.contains(node));
         for node in nodes {
@@ -172,16 +176,21 @@ impl Messages {
 
     fn read_journals(&mut self, take: &mut dyn FnMut(&Sighting<'_>)) {
         let names = self.entry.names();
-        let faults = &mut self.faults;
+        let (faults, read) = (&mut self.faults, &self.read);
         self.journals.retain(|node, journal| {
-            let polled = journal.poll(&mut |seen| hand_over(seen, &names, take));
+            let polled = journal.poll(&mut |seen| {
+                // The journal of a node has one copy of a message between two of its applications.
+                if seen.destination.node == *node || !has_another_copy(seen.is_sent, seen.destination, read) {
+                    hand_over(seen, &names, take);
+                }
+            });
             polled.map_err(|why| faults.insert(node.to_string(), why.to_string())).is_ok()
         });
     }
 
     fn ask_others(&mut self, take: &mut dyn FnMut(&Sighting<'_>)) {
         let Some(system) = &mut self.system else { return };
-        let names = self.entry.names();
+        let (names, read) = (self.entry.names(), &self.read);
         for (app, tid) in self.found.iter().filter(|(_, tid)| self.others.contains(&tid.node)) {
             let question = AskWatch { app: *tid, received: true, sent: true };
             let to = Tid::new(tid.node, AppAddress::INSPECT);
@@ -195,7 +204,10 @@ impl Messages {
                 match report {
                     Ok(report) => {
                         let now = Time::now();
-                        report.seen.iter().for_each(|seen| show_watched(seen, now, &names, take));
+                        let shown = |seen: &&SeenMessage| !has_another_copy(seen.is_sent, seen.target, read);
+                        report.seen.iter().filter(shown).for_each(|seen| {
+                            show_watched(seen, now, &names, take);
+                        });
                         if !report.more {
                             break;
                         }
@@ -252,6 +264,12 @@ fn discard(system: &mut System) {
     }
 }
 
+/// Returns whether a message is also seen at its destination, which is read: that copy has its age, and the sender's is
+/// left out.
+fn has_another_copy(is_sent: bool, destination: Tid, read: &BTreeSet<Tid>) -> bool {
+    is_sent && read.contains(&destination)
+}
+
 /// Returns the name of an address, or its text.
 fn name_of(tid: Tid, names: &Names) -> String {
     names.get(&tid).cloned().unwrap_or_else(|| tid.to_string())
@@ -292,6 +310,17 @@ mod tests {
     use sinew::message::{Class, Kind};
 
     use super::*;
+
+    #[test]
+    fn message_between_chosen_applications_is_shown_once() {
+        let [sender, receiver] =
+            [0x0a00_0001, 0x0a00_0002].map(|node| Tid::new(NodeAddress::new(node), AppAddress::new(0x1001)));
+        let (both, one) = (BTreeSet::from([sender, receiver]), BTreeSet::from([sender]));
+        let copies = |read| [true, false].map(|is_sent| !has_another_copy(is_sent, receiver, read));
+        assert_eq!(copies(&both), [false, true]);
+        // Only the sender's node is asked.
+        assert!(copies(&one)[0]);
+    }
 
     #[test]
     fn watched_message_has_a_time_of_this_host() {

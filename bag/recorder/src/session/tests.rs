@@ -272,6 +272,7 @@ fn follower_hands_over_messages_and_writes_no_file() {
     let mut seen = Vec::new();
     follower
         .poll(&mut |message| {
+            assert!(message.is_sent);
             let name = message.names.type_name(message.header.kind).map(str::to_owned);
             seen.push((message.header.sequence, message.destination, name, message.payload.to_vec()));
         })
