@@ -153,6 +153,11 @@ impl<C: Connection> Follower<C> {
         let report = ask(&mut self.connection, &self.question, RENEWED_WITHIN)?;
         self.renewal = Time::now() + RENEWAL;
         self.names.learn(&report, &[]);
+        // The lease had ended, for example because this program was stopped: the node has begun another journal.
+        if self.reader.is_closed()? {
+            self.reader = open(&report)?;
+            self.channels.clear();
+        }
         Ok(())
     }
 }
