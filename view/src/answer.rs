@@ -34,7 +34,7 @@ use crate::{
     pages::{Pages, wall_s},
     request::{self, Access, Document, Head, RequestError},
     source::Source,
-    stream::{self, Line},
+    stream::{self, Line, States},
 };
 
 /// Time limit from the request to the begin of the answer, except for questions to applications.
@@ -53,6 +53,7 @@ pub(crate) struct Shared {
     pub(crate) source: Arc<dyn Source>,
     pub(crate) cache: Cache,
     pub(crate) pages: Pages,
+    pub(crate) states: States,
     log: Mutex<EventLog>,
     questions: Arc<Semaphore>,
 }
@@ -60,7 +61,7 @@ pub(crate) struct Shared {
 impl Shared {
     pub(crate) fn new(source: Arc<dyn Source>, cache: Cache, pages: Pages, log: EventLog) -> Self {
         let questions = Arc::new(Semaphore::new(QUESTIONS_MAX));
-        Self { source, cache, pages, log: Mutex::new(log), questions }
+        Self { source, cache, pages, states: States::default(), log: Mutex::new(log), questions }
     }
 
     pub(crate) fn log(&self) -> MutexGuard<'_, EventLog> {

@@ -2,7 +2,7 @@
 
 use std::{
     sync::{
-        Arc,
+        Arc, Mutex, PoisonError,
         atomic::{AtomicBool, Ordering},
     },
     time::Duration,
@@ -17,7 +17,10 @@ use tokio::{
     time::{sleep, timeout},
 };
 
-use crate::{answer::Shared, body::event, cache::PAGE_FRESH, look::Look, model, pages::wall_s};
+use crate::{
+    answer::Shared, body::event, cache::PAGE_FRESH, events::EventLog, look::Look, model, pages::wall_s,
+    snapshot::Snapshot,
+};
 
 /// Events that wait for a page.
 const WAITING_MAX: usize = 8;
@@ -40,6 +43,27 @@ impl Line {
     /// Waits until the connection has to be closed, because its client reads nothing.
     pub(crate) async fn cut(&self) {
         self.cut.notified().await;
+    }
+}
+
+/// The event of the latest snapshot. All pages share it, so that a further page costs little.
+#[derive(Debug, Default)]
+pub(crate) struct States(Mutex<Option<(Arc<Snapshot>, Bytes)>>);
+
+impl States {
+    /// Returns the event of a snapshot. The first call for it looks for changes, too.
+    fn event(&self, snapshot: &Arc<Snapshot>, log: &mut EventLog) -> Bytes {
+        let mut latest = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some((of, event)) = &*latest
+            && Arc::ptr_eq(of, snapshot)
+        {
+            return event.clone();
+        }
+        let wall_ms = (wall_s() * 1e3) as u64;
+        log.observe(snapshot, wall_ms);
+        let event = event("state", &model::state(snapshot, wall_ms));
+        *latest = Some((Arc::clone(snapshot), event.clone()));
+        event
     }
 }
 
@@ -76,13 +100,8 @@ async fn send_states(shared: &Shared, events: &Sender<Bytes>) -> End {
     let mut last = 0;
     loop {
         let Some(snapshot) = shared.cache.snapshot(PAGE_FRESH).await else { return End::Closed };
-        let wall_ms = (wall_s() * 1e3) as u64;
-        let new = {
-            let mut log = shared.log();
-            log.observe(&snapshot, wall_ms);
-            log.after(last)
-        };
-        let mut parts = vec![event("state", &model::state(&snapshot, wall_ms))];
+        let mut parts = vec![shared.states.event(&snapshot, &mut shared.log())];
+        let new = shared.log().after(last);
         if let Some(event_last) = new.last() {
             last = event_last.number;
             parts.push(event("log", &serde_json::json!(new)));
@@ -101,6 +120,21 @@ async fn send_states(shared: &Shared, events: &Sender<Bytes>) -> End {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::metrics::tests::{lost, snapshot};
+
+    #[test]
+    fn pages_share_the_event_of_a_snapshot() {
+        let (states, mut log) = (States::default(), EventLog::default());
+        let first = Arc::new(snapshot());
+        let [one, other] = [0, 1].map(|_| states.event(&first, &mut log));
+        assert_eq!(one.as_ptr(), other.as_ptr());
+        let mut next = snapshot();
+        let gone = next.nodes.pop().expect("the knee").node;
+        let Ok(entry) = &mut next.entry else { panic!("it has answered") };
+        entry.lost.push(lost(gone, "knee", "crashed"));
+        assert_ne!(states.event(&Arc::new(next), &mut log), one);
+        assert!(!log.after(0).is_empty(), "the change is an event");
+    }
 
     #[test]
     fn page_that_reads_nothing_is_cut_off() {
