@@ -27,8 +27,9 @@ use crate::{
     assets::{self, Asset},
     auth::{self, Token},
     body::Content,
-    cache::{Cache, FRESH},
+    cache::{Cache, FRESH, PAGE_FRESH},
     events::EventLog,
+    listed::Listed,
     metrics::{self, Format},
     model,
     pages::{Pages, wall_s},
@@ -54,6 +55,7 @@ pub(crate) struct Shared {
     pub(crate) cache: Cache,
     pub(crate) pages: Pages,
     pub(crate) states: States,
+    listed: Listed,
     log: Mutex<EventLog>,
     questions: Arc<Semaphore>,
 }
@@ -61,7 +63,8 @@ pub(crate) struct Shared {
 impl Shared {
     pub(crate) fn new(source: Arc<dyn Source>, cache: Cache, pages: Pages, log: EventLog) -> Self {
         let questions = Arc::new(Semaphore::new(QUESTIONS_MAX));
-        Self { source, cache, pages, states: States::default(), log: Mutex::new(log), questions }
+        let (states, listed) = (States::default(), Listed::default());
+        Self { source, cache, pages, states, listed, log: Mutex::new(log), questions }
     }
 
     pub(crate) fn log(&self) -> MutexGuard<'_, EventLog> {
@@ -174,9 +177,14 @@ async fn metrics(shared: &Shared, format: Format) -> Response<Content> {
 }
 
 async fn parameters(shared: &Arc<Shared>) -> Response<Content> {
-    match asked(shared, |source| source.parameters()).await {
-        Ok(Ok(apps)) => json(StatusCode::OK, &model::parameters(&apps)),
-        Ok(Err(why)) | Err(why) => json(StatusCode::SERVICE_UNAVAILABLE, &json!({ "fault": why })),
+    let ask = || async {
+        let apps = asked(shared, |source| source.parameters()).await.flatten()?;
+        Ok::<_, String>(model::parameters(&apps))
+    };
+    let late = || Err(format!("the nodes gave no answer within {ASKED_WITHIN:?}; try again"));
+    match timeout(ASKED_WITHIN, shared.listed.get(PAGE_FRESH, ask)).await.unwrap_or_else(|_| late()) {
+        Ok(list) => json(StatusCode::OK, &list),
+        Err(why) => json(StatusCode::SERVICE_UNAVAILABLE, &json!({ "fault": why })),
     }
 }
 
@@ -204,6 +212,7 @@ async fn apply(shared: &Arc<Shared>, app: String, order: SetParameters) -> Resul
     let of = Arc::clone(shared);
     let outcome = asked(shared, move |source| {
         let outcome = source.set(&app, &order);
+        of.listed.forget();
         of.record(&app, &order, &outcome);
         outcome
     });
