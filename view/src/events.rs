@@ -70,10 +70,11 @@ impl EventLog {
             snapshot.nodes.iter().filter(|one| one.result.is_err()).map(|one| one.node).collect();
         let answers: BTreeSet<_> =
             snapshot.nodes.iter().filter(|one| one.result.is_ok()).map(|one| one.node).collect();
+        // Beyond the bound a fact that is missing may only have been left out.
+        let is_whole = new.len().max(known.len()) < FACTS_MAX;
         for (key, fact) in &new {
-            if known
-                .get(key)
-                .is_none_or(|former| (&former.text, former.is_fine) != (&fact.text, fact.is_fine))
+            let former = known.get(key);
+            if former.map_or(is_whole, |former| (&former.text, former.is_fine) != (&fact.text, fact.is_fine))
             {
                 self.push(wall_ms, key, fact.text.clone(), fact.is_fine);
             }
@@ -85,7 +86,7 @@ impl EventLog {
             if silent.contains(&fact.node) {
                 // Its node gives no answer, which is an event by itself.
                 new.insert(key, fact);
-            } else if answers.contains(&fact.node) {
+            } else if is_whole && answers.contains(&fact.node) {
                 let is_barrier = key.0 == "barrier";
                 let text = if is_barrier { "nothing waits there any more" } else { "has gone" };
                 self.push(wall_ms, &key, text.to_owned(), is_barrier);
@@ -204,6 +205,8 @@ fn missing(missing: &[Missing]) -> Option<String> {
 
 #[cfg(test)]
 mod tests {
+    use sinew::inspect::AppReport;
+
     use super::*;
     use crate::metrics::tests::{lost, snapshot};
 
@@ -244,6 +247,27 @@ mod tests {
         assert_eq!(found, ["node knee: gives no answer: no answer"]);
         log.observe(&snapshot(), 3);
         assert_eq!(texts(&log, 1), ["node knee: is up"]);
+    }
+
+    #[test]
+    fn facts_beyond_their_bound_cause_no_events() {
+        let with = |count: usize| {
+            let mut all = snapshot();
+            let Ok(hip) = &mut all.nodes[0].result else { panic!("it has answered") };
+            let app = hip.apps.apps.iter().find(|app| app.name.is_some()).expect("a name").clone();
+            let name = |number| AppReport { name: Some(format!("app{number}")), ..app.clone() };
+            hip.apps.apps = (0..count).map(name).collect();
+            all
+        };
+        let mut log = EventLog::default();
+        log.observe(&with(FACTS_MAX), 1);
+        log.observe(&with(FACTS_MAX - 10), 2);
+        assert!(log.after(0).is_empty(), "{:?}", texts(&log, 0));
+        // And: below it they do
+        let mut log = EventLog::default();
+        log.observe(&with(10), 1);
+        log.observe(&with(11), 2);
+        assert_eq!(log.after(0).len(), 1, "{:?}", texts(&log, 0));
     }
 
     #[test]
