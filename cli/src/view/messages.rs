@@ -52,6 +52,9 @@ pub(super) struct Messages {
     journals: BTreeMap<NodeAddress, Follower<Own>>,
     /// Nodes with a journal out of reach.
     others: BTreeSet<NodeAddress>,
+    /// Those that gave no answer: they are asked again after the next look at the addresses, since nothing else is read
+    /// meanwhile.
+    silent: BTreeSet<NodeAddress>,
 }
 
 /// The connection to a node of this host.
@@ -103,6 +106,7 @@ impl Messages {
             watch_due: now,
             journals: BTreeMap::new(),
             others: BTreeSet::new(),
+            silent: BTreeSet::new(),
         }
     }
 
@@ -110,6 +114,7 @@ impl Messages {
     fn resolve(&mut self, now: Time) -> Result<(), String> {
         self.resolve_due = now + RESOLVED_EVERY;
         self.faults.clear();
+        self.silent.clear();
         let mut system = match self.system.take() {
             Some(system) => system,
             None => self.entry.enter(self.within)?,
@@ -192,6 +197,9 @@ impl Messages {
         let Some(system) = &mut self.system else { return };
         let (names, read) = (self.entry.names(), &self.read);
         for (app, tid) in self.found.iter().filter(|(_, tid)| self.others.contains(&tid.node)) {
+            if self.silent.contains(&tid.node) {
+                continue;
+            }
             let question = AskWatch { app: *tid, received: true, sent: true };
             let to = Tid::new(tid.node, AppAddress::INSPECT);
             for _ in 0..WATCHED_MAX {
@@ -199,7 +207,10 @@ impl Messages {
                 let report = match asked {
                     Ok(WatchReport { refused: Some(why), .. }) => Err(why),
                     Ok(report) => Ok(report),
-                    Err(why) => Err(in_words(&why)),
+                    Err(why) => {
+                        self.silent.insert(tid.node);
+                        Err(in_words(&why))
+                    }
                 };
                 match report {
                     Ok(report) => {
