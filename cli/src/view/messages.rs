@@ -185,7 +185,9 @@ impl Messages {
         self.journals.retain(|node, journal| {
             let polled = journal.poll(&mut |seen| {
                 // The journal of a node has one copy of a message between two of its applications.
-                if seen.destination.node == *node || !has_another_copy(seen.is_sent, seen.destination, read) {
+                if seen.destination.node == *node
+                    || !has_another_copy(seen.is_sent && !seen.is_rejected, seen.destination, read)
+                {
                     hand_over(seen, &names, take);
                 }
             });
@@ -215,7 +217,9 @@ impl Messages {
                 match report {
                     Ok(report) => {
                         let now = Time::now();
-                        let shown = |seen: &&SeenMessage| !has_another_copy(seen.is_sent, seen.target, read);
+                        let shown = |seen: &&SeenMessage| {
+                            !has_another_copy(seen.is_sent && seen.refused.is_none(), seen.target, read)
+                        };
                         report.seen.iter().filter(shown).for_each(|seen| {
                             show_watched(seen, now, &names, take);
                         });
@@ -275,10 +279,10 @@ fn discard(system: &mut System) {
     }
 }
 
-/// Returns whether a message is also seen at its destination, which is read: that copy has its age, and the sender's is
-/// left out.
-fn has_another_copy(is_sent: bool, destination: Tid, read: &BTreeSet<Tid>) -> bool {
-    is_sent && read.contains(&destination)
+/// Returns whether a copy of the sender has another one at the destination, which is read: that one has the age of the
+/// message, and the sender's is left out. A message that was rejected at its sender has none.
+fn has_another_copy(has_left: bool, destination: Tid, read: &BTreeSet<Tid>) -> bool {
+    has_left && read.contains(&destination)
 }
 
 /// Returns the name of an address, or its text.
@@ -327,7 +331,7 @@ mod tests {
         let [sender, receiver] =
             [0x0a00_0001, 0x0a00_0002].map(|node| Tid::new(NodeAddress::new(node), AppAddress::new(0x1001)));
         let (both, one) = (BTreeSet::from([sender, receiver]), BTreeSet::from([sender]));
-        let copies = |read| [true, false].map(|is_sent| !has_another_copy(is_sent, receiver, read));
+        let copies = |read| [true, false].map(|has_left| !has_another_copy(has_left, receiver, read));
         assert_eq!(copies(&both), [false, true]);
         // Only the sender's node is asked.
         assert!(copies(&one)[0]);
