@@ -196,12 +196,19 @@ fn send(system: &mut System, app: &str, to: Tid, set: &SetParameters) -> Result<
     sent.map_err(|error| words(&error, app, true))
 }
 
-/// Sets parameters for the page of `sinew view`.
-///
-/// # Errors
-/// Why there is no outcome, with the remedy.
-pub(crate) fn set(system: &mut System, app: &str, set: &SetParameters) -> Result<ParameterOutcome, String> {
-    SetResult::of(system, app, set).map_err(|why| why.to_string())?.outcome
+/// Sets parameters for the page of `sinew view`. Also returns the lines for the terminal.
+pub(crate) fn set(
+    system: &mut System,
+    app: &str,
+    set: &SetParameters,
+) -> (Result<ParameterOutcome, String>, String) {
+    match SetResult::of(system, app, set) {
+        Ok(result) => {
+            let text = result.text();
+            (result.outcome, text)
+        }
+        Err(why) => (Err(why.to_string()), format!("{}: {}\n", clean(app), clean(&why.to_string()))),
+    }
 }
 
 /// Returns the parameters of each application that has some, for the page of `sinew view`.

@@ -158,14 +158,9 @@ impl Source for Nodes {
 
     fn set(&self, app: &str, set: &SetParameters) -> Result<ParameterOutcome, String> {
         let mut system = self.entry.enter(self.within)?;
-        let outcome = param::set(&mut system, app, set);
+        let (outcome, text) = param::set(&mut system, app, set);
         self.entry.leave(system);
-        let end = match &outcome {
-            Ok(ParameterOutcome::Applied { tick, .. }) => format!("applied at tick {tick}"),
-            Ok(ParameterOutcome::Refused { why }) => format!("refused: {why}"),
-            Err(why) => why.clone(),
-        };
-        output::note(format_args!("sinew: the page set {}: {}", clean(app), clean(&end)));
+        output::note(format_args!("sinew: a set of the page: {}", text.trim_end()));
         outcome
     }
 

@@ -140,12 +140,16 @@ async function setParameter(page) {
   await form.waitFor({ timeout: STEP_MS });
   const number = form.locator("input[type=number]");
   const before = Number(await number.inputValue());
+  const other = page.locator('[data-app="knee.drive"] input[data-parameter="damping"]');
+  const written = `${Number(await other.inputValue()) + 0.125}`;
+  await other.fill(written);
   await form.locator("input[type=range]").focus();
   await page.keyboard.press("ArrowLeft");
   const outcome = page.locator("#parameter-outcome", { hasText: "applied" });
   await outcome.waitFor({ timeout: STEP_MS });
   check("a moved slider is applied at a tick", /knee\.drive: assistance = .* at tick \d+/.test(await outcome.textContent()), await outcome.textContent());
   await page.waitForFunction(() => !document.querySelector('[data-undo="knee.drive"]').disabled, null, { timeout: STEP_MS });
+  check("a set keeps what is written beside it", (await other.inputValue()) === written, written);
   await page.locator('[data-undo="knee.drive"]').click();
   await page.locator("#parameter-outcome", { hasText: `= ${before}` }).waitFor({ timeout: STEP_MS });
   check("undo gives the former value", true, await outcome.textContent());
@@ -181,6 +185,7 @@ async function attack(address) {
     ["a write of another origin", 403, post({ cookie, origin: evil })],
     ["a write without an origin", 403, post({ cookie })],
     ["a stream of another origin", 403, get("/api/stream", { cookie, origin: evil })],
+    ["a list of another origin", 403, get("/api/parameters", { cookie, origin: evil })],
     ["a huge query", 400, get(`/api/stream?app=${"x".repeat(5_000)}`, { cookie })],
     ["a huge body", 413, post({ cookie, origin }, JSON.stringify({ app: "x".repeat(40_000) }))],
     ["a body that claims a role", 400, post({ cookie, origin }, '{"app":"knee.drive","undo":true,"role":"operator"}')],

@@ -72,10 +72,14 @@ function drawConnection() {
   document.body.classList.toggle("stale", !isFresh);
 }
 
-/** Opens the stream, or opens it anew after the choice of plots has changed. */
-function open() {
+function close() {
   clearTimeout(retry);
   stream?.close();
+}
+
+/** Opens the stream, or opens it anew after the choice of plots has changed. */
+function open() {
+  close();
   stream = new EventSource(`/api/stream${plots.query()}`);
   const on = (name, take) => stream.addEventListener(name, (event) => take(JSON.parse(event.data)));
   on("state", (data) => {
@@ -92,7 +96,7 @@ function open() {
     if (stream.readyState === EventSource.CLOSED) {
       retry = setTimeout(open, 1000);
       byId("fault").hidden = false;
-      byId("fault").textContent = "The stream is refused. If sinew view was started anew, open the address that it has printed; if many pages are open, close one.";
+      byId("fault").textContent = "The stream is refused. If sinew view was started anew, open the address that it has printed; if many pages are open, close one; if many fields are plotted, remove some.";
     }
     drawConnection();
   });
@@ -100,13 +104,16 @@ function open() {
 
 plots.onChange(open);
 setInterval(drawConnection, 500);
-// A page that is not seen needs no stream: the nodes are not asked for it.
-document.addEventListener("visibilitychange", () => {
+// A page that is not seen needs no stream and no parameters: the nodes are not asked for it.
+function follow() {
+  parameters.setShown(!document.hidden && !byId("parameters").hidden);
+  plots.cut();
   if (document.hidden) {
-    stream?.close();
+    close();
   } else {
     open();
   }
-});
+}
+document.addEventListener("visibilitychange", follow);
 show(tabs[0], false);
-open();
+follow();

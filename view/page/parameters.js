@@ -15,13 +15,18 @@ export function setShown(shown) {
   if (shown) refresh();
 }
 
+/** Returns the JSON of an answer, or the text of a refusal as its fault. */
+async function read(answer) {
+  const isJson = answer.headers.get("Content-Type") === "application/json";
+  return isJson ? answer.json() : { fault: (await answer.text()).trim() };
+}
+
 const valueOf = (value) => Object.values(value)[0];
 
 async function refresh() {
   clearTimeout(timer);
   try {
-    const answer = await fetch("/api/parameters");
-    const data = await answer.json();
+    const data = await read(await fetch("/api/parameters"));
     if (data.fault) say(data.fault, false);
     else draw(data.apps);
   } catch (why) {
@@ -45,7 +50,7 @@ async function send(app, order) {
       headers: { "Content-Type": "application/json" },
       body: JSON.stringify({ app, ...order }),
     });
-    const { outcome, fault } = await answer.json();
+    const { outcome, fault } = await read(answer);
     if (fault) return say(`${app}: ${fault}`, false);
     if (outcome.Refused) return say(`${app}: refused: ${outcome.Refused.why}`, false);
     const { tick, values } = outcome.Applied;
@@ -54,8 +59,10 @@ async function send(app, order) {
   } catch (why) {
     say(`${app}: no outcome: ${why.message}; the values may have been set`, false);
   } finally {
-    rows.forEach((row) => row.app === app && (row.isEdited = false));
-    refresh();
+    // Other rows keep what the user has written there; an undo may change any.
+    const sent = order.values?.map((one) => one.name);
+    rows.forEach((row) => row.app === app && (sent?.includes(row.name) ?? true) && (row.isEdited = false));
+    if (isShown) refresh();
   }
 }
 
@@ -92,7 +99,7 @@ function row(app, one) {
   const slider = isFlag ? null : make("input", { type: "range", min, max, step, "aria-label": `${one.name}, slider`, "data-slider": one.name });
   const current = make("output", { for: id });
   const set = (value) => send(app, { values: [{ name: one.name, value: `${value}` }] });
-  const state = { app, isEdited: false, update: () => {} };
+  const state = { app, name: one.name, isEdited: false, update: () => {} };
   input.addEventListener("input", () => (state.isEdited = true));
   slider?.addEventListener("input", () => {
     state.isEdited = true;

@@ -8,7 +8,7 @@ const POINTS_MAX = 20000;
 const SEPARATOR = "\t";
 
 const apps = new Set();
-/** The plotted fields, in the order of the query: key, times, values, the chart and its element. */
+/** The plotted fields, in the order of the query: key, points, whether some are missing, the chart, its element. */
 let series = [];
 let isShown = false;
 let isPaused = false;
@@ -23,8 +23,14 @@ export function onChange(take) {
 export function setShown(shown) {
   if (shown === isShown) return;
   isShown = shown;
+  cut();
   if (apps.size > 0) changed();
   if (shown) draw();
+}
+
+/** The next points of each plot come after a gap: meanwhile none were read. */
+export function cut() {
+  for (const one of series) one.hasGap = true;
 }
 
 /** Returns the query of the stream: the applications and the fields at which this page looks. */
@@ -94,7 +100,7 @@ byId("messages").addEventListener("click", (event) => {
   if (known) {
     remove(known);
   } else if (series.length < SERIES_MAX) {
-    series.push({ key, t: [], v: [], chart: null, element: null });
+    series.push({ key, t: [], v: [], hasGap: false, chart: null, element: null });
   }
   button.setAttribute("aria-pressed", `${!known}`);
   changed();
@@ -110,18 +116,22 @@ function remove(one) {
 export function addPoints(all) {
   for (const part of all) {
     const one = series[part.series];
-    if (!one || isPaused) continue;
-    const last = one.t.at(-1) ?? 0;
-    part.t.forEach((t, place) => {
-      // uPlot needs times in order.
-      if (t > last) {
-        one.t.push(t);
-        one.v.push(part.v[place]);
-      }
-    });
+    if (!one) continue;
+    one.hasGap ||= isPaused || part.dropped > 0;
+    if (isPaused || part.t.length === 0) continue;
+    if (one.hasGap) push(one, part.t[0] - 1e-6, null);
+    one.hasGap = false;
+    part.t.forEach((t, place) => push(one, t, part.v[place]));
     trim(one);
   }
   frame ||= requestAnimationFrame(draw);
+}
+
+/** Adds a point; without a value it is a gap. uPlot needs times in order. */
+function push(one, t, v) {
+  if (t <= (one.t.at(-1) ?? 0)) return;
+  one.t.push(t);
+  one.v.push(v);
 }
 
 const seconds = () => Math.min(120, Math.max(1, Number(byId("seconds").value) || 10));

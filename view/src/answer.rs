@@ -27,14 +27,15 @@ use crate::{
     assets::{self, Asset},
     auth::{self, Token},
     body::Content,
-    cache::{Cache, FRESH},
+    cache::{Cache, FRESH, PAGE_FRESH},
     events::EventLog,
+    listed::Listed,
     metrics::{self, Format},
     model,
     pages::{Pages, wall_s},
     request::{self, Access, Document, Head, RequestError},
     source::Source,
-    stream::{self, Line},
+    stream::{self, Line, States},
 };
 
 /// Time limit from the request to the begin of the answer, except for questions to applications.
@@ -53,6 +54,8 @@ pub(crate) struct Shared {
     pub(crate) source: Arc<dyn Source>,
     pub(crate) cache: Cache,
     pub(crate) pages: Pages,
+    pub(crate) states: States,
+    listed: Listed,
     log: Mutex<EventLog>,
     questions: Arc<Semaphore>,
 }
@@ -60,11 +63,27 @@ pub(crate) struct Shared {
 impl Shared {
     pub(crate) fn new(source: Arc<dyn Source>, cache: Cache, pages: Pages, log: EventLog) -> Self {
         let questions = Arc::new(Semaphore::new(QUESTIONS_MAX));
-        Self { source, cache, pages, log: Mutex::new(log), questions }
+        let (states, listed) = (States::default(), Listed::default());
+        Self { source, cache, pages, states, listed, log: Mutex::new(log), questions }
     }
 
     pub(crate) fn log(&self) -> MutexGuard<'_, EventLog> {
         self.log.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Returns those of a server without a system.
+    #[cfg(test)]
+    pub(crate) fn without_system() -> Arc<Self> {
+        let source: Arc<dyn Source> = Arc::new(crate::source::NoSystem);
+        let cache = Cache::start(Arc::clone(&source), Duration::ZERO).expect("a thread");
+        let pages = Pages::start(Arc::clone(&source)).expect("a thread");
+        Arc::new(Self::new(source, cache, pages, EventLog::default()))
+    }
+
+    /// Adds a set with its outcome to the log of events.
+    fn record(&self, app: &str, order: &SetParameters, outcome: &Result<ParameterOutcome, String>) {
+        let is_applied = matches!(outcome, Ok(ParameterOutcome::Applied { .. }));
+        self.log().write((wall_s() * 1e3) as u64, app, sentence(order, outcome), is_applied);
     }
 }
 
@@ -158,13 +177,18 @@ async fn metrics(shared: &Shared, format: Format) -> Response<Content> {
 }
 
 async fn parameters(shared: &Arc<Shared>) -> Response<Content> {
-    match asked(shared, |source| source.parameters()).await {
-        Ok(Ok(apps)) => json(StatusCode::OK, &model::parameters(&apps)),
-        Ok(Err(why)) | Err(why) => json(StatusCode::SERVICE_UNAVAILABLE, &json!({ "fault": why })),
+    let ask = || async {
+        let apps = asked(shared, |source| source.parameters()).await.flatten()?;
+        Ok::<_, String>(model::parameters(&apps))
+    };
+    let late = || Err(format!("the nodes gave no answer within {ASKED_WITHIN:?}; try again"));
+    match timeout(ASKED_WITHIN, shared.listed.get(PAGE_FRESH, ask)).await.unwrap_or_else(|_| late()) {
+        Ok(list) => json(StatusCode::OK, &list),
+        Err(why) => json(StatusCode::SERVICE_UNAVAILABLE, &json!({ "fault": why })),
     }
 }
 
-/// Sets parameters, and records that in the log of events and on the terminal.
+/// Sets parameters. The set is recorded in the log of events and on the terminal.
 async fn set(shared: &Arc<Shared>, body: Incoming) -> Response<Content> {
     let body = match timeout(ANSWER_WITHIN, Limited::new(body, BODY_BYTES_MAX).collect()).await {
         Ok(Ok(body)) => body.to_bytes(),
@@ -177,14 +201,22 @@ async fn set(shared: &Arc<Shared>, body: Incoming) -> Response<Content> {
         Ok(order) => order,
         Err(why) => return json(StatusCode::BAD_REQUEST, &json!({ "fault": why })),
     };
-    let (to, ordered) = (app.clone(), order.clone());
-    let outcome = asked(shared, move |source| source.set(&to, &ordered)).await.flatten();
-    let is_applied = matches!(outcome, Ok(ParameterOutcome::Applied { .. }));
-    shared.log().write((wall_s() * 1e3) as u64, app, sentence(&order, &outcome), is_applied);
-    match outcome {
+    match apply(shared, app, order).await {
         Ok(outcome) => json(StatusCode::OK, &json!({ "outcome": outcome })),
         Err(why) => json(StatusCode::CONFLICT, &json!({ "fault": why })),
     }
+}
+
+/// Sets parameters. Its outcome is logged where it is known: the page may have closed its connection meanwhile.
+async fn apply(shared: &Arc<Shared>, app: String, order: SetParameters) -> Result<ParameterOutcome, String> {
+    let of = Arc::clone(shared);
+    let outcome = asked(shared, move |source| {
+        let outcome = source.set(&app, &order);
+        of.listed.forget();
+        of.record(&app, &order, &outcome);
+        outcome
+    });
+    outcome.await.flatten()
 }
 
 /// Returns the sentence of the log.
@@ -199,7 +231,9 @@ fn sentence(order: &SetParameters, outcome: &Result<ParameterOutcome, String>) -
     };
     match outcome {
         Ok(ParameterOutcome::Applied { tick, values, .. }) => {
-            format!("{order}: applied at tick {tick}: {}", list(values))
+            let place =
+                if *tick == 0 { "between two messages".to_owned() } else { format!("at tick {tick}") };
+            format!("{order}: applied {place}: {}", list(values))
         }
         Ok(ParameterOutcome::Refused { why }) => format!("{order}: refused: {why}"),
         Err(why) => format!("{order}: {why}"),
@@ -300,10 +334,34 @@ mod tests {
     }
 
     #[test]
+    fn set_is_logged_also_after_its_page_has_gone() {
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_time().build();
+        runtime.expect("a runtime").block_on(async {
+            let shared = Shared::without_system();
+            tokio::select! {
+                biased;
+                _ = apply(&shared, "knee".to_owned(), SetParameters::Undo) => {}
+                () = std::future::ready(()) => {}
+            }
+            // The question has ended when its place is free again.
+            let all = u32::try_from(QUESTIONS_MAX).expect("it is small");
+            let _all = shared.questions.acquire_many(all).await.expect("nothing closes it");
+            let events = shared.log().after(0);
+            assert_eq!(events.len(), 1);
+            assert_eq!((events[0].topic, events[0].subject.as_str()), ("write", "knee"));
+        });
+    }
+
+    #[test]
     fn write_is_logged_with_its_outcome() {
         let order = SetParameters::Values(vec![named("gain", Value::Number(0.5))]);
         let refused = Ok(ParameterOutcome::Refused { why: "outside 0 to 1".to_owned() });
         assert_eq!(sentence(&order, &refused), "gain = 0.5: refused: outside 0 to 1");
+        let applied = Ok(ParameterOutcome::Applied { tick: 0, at_ns: 1, values: Vec::new() });
+        assert_eq!(
+            sentence(&SetParameters::Undo, &applied),
+            "undo of the last set: applied between two messages: "
+        );
         let fault = Err("no right".to_owned());
         assert_eq!(sentence(&SetParameters::Undo, &fault), "undo of the last set: no right");
     }

@@ -68,6 +68,8 @@ fn answer_orders(
         let last = publish.borrow().as_ref().map(|snapshot| snapshot.taken);
         // The order may have come before the begin of the last snapshot, which has answered it then.
         if last.is_some_and(|taken| taken >= ordered) {
+            // A request may have come after that snapshot and found the queue full: it gets this one.
+            publish.send_modify(|_| ());
             continue;
         }
         if let Some(left) = last.and_then(|taken| least.checked_sub(Time::now().since(taken))) {

@@ -1,5 +1,5 @@
 //! A series of values with at most two points in each sixtieth of a second: its least and its greatest value. So no
-//! peak is lost.
+//! peak is lost. A value that is no number is a third point, without a value: a gap of the plot.
 
 use std::collections::VecDeque;
 
@@ -15,8 +15,10 @@ pub(crate) type Point = (u64, f64);
 #[derive(Clone, Copy, Debug)]
 struct Slot {
     number: u64,
-    least: Point,
-    greatest: Point,
+    /// The least and the greatest value.
+    extremes: Option<(Point, Point)>,
+    /// When it last had a value that is no number.
+    gap_ns: Option<u64>,
 }
 
 /// Thins out a series.
@@ -28,25 +30,24 @@ pub(crate) struct Decimator {
 }
 
 impl Decimator {
-    /// Takes a value. Those that are no number leave a gap. A value with an earlier time counts for the current slot.
+    /// Takes a value. A value with an earlier time counts for the current slot.
     pub(crate) fn take(&mut self, at_ns: u64, value: f64) {
+        let number = at_ns / SLOT_NS;
+        if self.slot.is_some_and(|slot| slot.number < number) {
+            self.end_slot();
+        }
+        let slot = self.slot.get_or_insert(Slot { number, extremes: None, gap_ns: None });
+        let point = (at_ns, value);
         if !value.is_finite() {
+            slot.gap_ns = Some(at_ns);
             return;
         }
-        let point = (at_ns, value);
-        match &mut self.slot {
-            Some(slot) if at_ns / SLOT_NS <= slot.number => {
-                if value < slot.least.1 {
-                    slot.least = point;
-                }
-                if value > slot.greatest.1 {
-                    slot.greatest = point;
-                }
-            }
-            Some(_) | None => {
-                self.end_slot();
-                self.slot = Some(Slot { number: at_ns / SLOT_NS, least: point, greatest: point });
-            }
+        let (least, greatest) = slot.extremes.get_or_insert((point, point));
+        if value < least.1 {
+            *least = point;
+        }
+        if value > greatest.1 {
+            *greatest = point;
         }
     }
 
@@ -64,12 +65,13 @@ impl Decimator {
     }
 
     fn end_slot(&mut self) {
-        let Some(Slot { least, greatest, .. }) = self.slot.take() else { return };
-        let (first, last) = if least.0 <= greatest.0 { (least, greatest) } else { (greatest, least) };
-        self.put(first);
-        if last != first {
-            self.put(last);
-        }
+        let Some(Slot { extremes, gap_ns, .. }) = self.slot.take() else { return };
+        let (least, greatest) = extremes.unzip();
+        let one = greatest.filter(|greatest| Some(*greatest) != least);
+        let mut points: Vec<_> = least.into_iter().chain(one).collect();
+        points.extend(gap_ns.map(|at_ns| (at_ns, f64::NAN)));
+        points.sort_by_key(|(at_ns, _)| *at_ns);
+        points.into_iter().for_each(|point| self.put(point));
     }
 
     fn put(&mut self, point: Point) {
@@ -101,13 +103,27 @@ mod tests {
     }
 
     #[test]
-    fn constant_value_is_one_point_and_nan_none() {
+    fn constant_value_is_one_point() {
         let mut series = Decimator::default();
         for at in 0..10 {
             series.take(at * MS, 2.0);
-            series.take(at * MS, f64::NAN);
         }
         assert_eq!(series.drain(20 * MS), [(0, 2.0)]);
+    }
+
+    #[test]
+    fn values_without_a_number_are_one_gap() {
+        let mut series = Decimator::default();
+        for at in 0..10 {
+            series.take(at * MS, 2.0 + at as f64);
+            series.take(at * MS, if at < 6 { f64::NAN } else { 0.0 });
+        }
+        series.take(20 * MS, f64::INFINITY);
+        let found = series.drain(u64::MAX);
+        let times: Vec<_> = found.iter().map(|(at, _)| at / MS).collect();
+        assert_eq!(times, [5, 6, 9, 20], "{found:?}");
+        assert!(found[0].1.is_nan() && found[3].1.is_nan());
+        assert_eq!((found[1].1, found[2].1), (0.0, 11.0));
     }
 
     #[test]

@@ -70,10 +70,11 @@ impl EventLog {
             snapshot.nodes.iter().filter(|one| one.result.is_err()).map(|one| one.node).collect();
         let answers: BTreeSet<_> =
             snapshot.nodes.iter().filter(|one| one.result.is_ok()).map(|one| one.node).collect();
+        // Beyond the bound a fact that is missing may only have been left out.
+        let is_whole = new.len().max(known.len()) < FACTS_MAX;
         for (key, fact) in &new {
-            if known
-                .get(key)
-                .is_none_or(|former| (&former.text, former.is_fine) != (&fact.text, fact.is_fine))
+            let former = known.get(key);
+            if former.map_or(is_whole, |former| (&former.text, former.is_fine) != (&fact.text, fact.is_fine))
             {
                 self.push(wall_ms, key, fact.text.clone(), fact.is_fine);
             }
@@ -85,7 +86,7 @@ impl EventLog {
             if silent.contains(&fact.node) {
                 // Its node gives no answer, which is an event by itself.
                 new.insert(key, fact);
-            } else if answers.contains(&fact.node) {
+            } else if is_whole && answers.contains(&fact.node) {
                 let is_barrier = key.0 == "barrier";
                 let text = if is_barrier { "nothing waits there any more" } else { "has gone" };
                 self.push(wall_ms, &key, text.to_owned(), is_barrier);
@@ -95,8 +96,8 @@ impl EventLog {
     }
 
     /// Adds an event of this program, such as a set of parameters.
-    pub(crate) fn write(&mut self, wall_ms: u64, subject: String, text: String, is_fine: bool) {
-        self.push(wall_ms, &("write", subject), text, is_fine);
+    pub(crate) fn write(&mut self, wall_ms: u64, subject: &str, text: String, is_fine: bool) {
+        self.push(wall_ms, &("write", bounded(subject)), text, is_fine);
     }
 
     /// Returns the events after this number that are still kept.
@@ -204,6 +205,8 @@ fn missing(missing: &[Missing]) -> Option<String> {
 
 #[cfg(test)]
 mod tests {
+    use sinew::inspect::AppReport;
+
     use super::*;
     use crate::metrics::tests::{lost, snapshot};
 
@@ -247,14 +250,35 @@ mod tests {
     }
 
     #[test]
+    fn facts_beyond_their_bound_cause_no_events() {
+        let with = |count: usize| {
+            let mut all = snapshot();
+            let Ok(hip) = &mut all.nodes[0].result else { panic!("it has answered") };
+            let app = hip.apps.apps.iter().find(|app| app.name.is_some()).expect("a name").clone();
+            let name = |number| AppReport { name: Some(format!("app{number}")), ..app.clone() };
+            hip.apps.apps = (0..count).map(name).collect();
+            all
+        };
+        let mut log = EventLog::default();
+        log.observe(&with(FACTS_MAX), 1);
+        log.observe(&with(FACTS_MAX - 10), 2);
+        assert!(log.after(0).is_empty(), "{:?}", texts(&log, 0));
+        // And: below it they do
+        let mut log = EventLog::default();
+        log.observe(&with(10), 1);
+        log.observe(&with(11), 2);
+        assert_eq!(log.after(0).len(), 1, "{:?}", texts(&log, 0));
+    }
+
+    #[test]
     fn events_have_a_bound_and_numbers_without_gaps() {
         let mut log = EventLog::default();
         for number in 0..EVENTS_MAX as u64 + 3 {
-            log.write(number, "knee".to_owned(), "x".repeat(2 * TEXT_MAX), true);
+            log.write(number, &"knee".repeat(TEXT_MAX), "x".repeat(2 * TEXT_MAX), true);
         }
         let events = log.after(0);
         assert_eq!((events.len(), events[0].number), (EVENTS_MAX, 4));
-        assert!(events.iter().all(|event| event.text.len() == TEXT_MAX));
+        assert!(events.iter().all(|event| event.text.len() == TEXT_MAX && event.subject.len() < TEXT_MAX));
         assert_eq!(log.after(EVENTS_MAX as u64 + 2).len(), 1);
     }
 }

@@ -31,11 +31,14 @@ struct Numbers<'f> {
 }
 
 impl Numbers<'_> {
-    fn number(self, value: f64) {
-        if *self.left > 0 && self.path.len() <= PATH_MAX {
-            *self.left -= 1;
-            (self.take)(self.path, value);
+    fn number<E: de::Error>(self, value: f64) -> Result<(), E> {
+        if self.path.len() > PATH_MAX {
+            return Ok(());
         }
+        // The rest of a long list is not read.
+        *self.left = self.left.checked_sub(1).ok_or_else(|| E::custom("further numbers"))?;
+        (self.take)(self.path, value);
+        Ok(())
     }
 
     /// Reads one member. Its path has one more part.
@@ -72,23 +75,19 @@ impl<'de> Visitor<'de> for Numbers<'_> {
     }
 
     fn visit_bool<E: de::Error>(self, value: bool) -> Result<(), E> {
-        self.number(f64::from(u8::from(value)));
-        Ok(())
+        self.number(f64::from(u8::from(value)))
     }
 
     fn visit_u64<E: de::Error>(self, value: u64) -> Result<(), E> {
-        self.number(value as f64);
-        Ok(())
+        self.number(value as f64)
     }
 
     fn visit_i64<E: de::Error>(self, value: i64) -> Result<(), E> {
-        self.number(value as f64);
-        Ok(())
+        self.number(value as f64)
     }
 
     fn visit_f64<E: de::Error>(self, value: f64) -> Result<(), E> {
-        self.number(value);
-        Ok(())
+        self.number(value)
     }
 
     fn visit_unit<E: de::Error>(self) -> Result<(), E> {

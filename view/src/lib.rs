@@ -1,7 +1,8 @@
 //! `sinew view`: the state of a running system as a page for people, and as metrics for Prometheus, over HTTP.
 //!
 //! It knows no node. A [`Source`], which the command `sinew` has, asks the nodes for a [`Snapshot`], sets parameters
-//! and reads messages. The [`Server`] asks it at most three times a second, however many requests there are.
+//! and reads messages. The [`Server`] asks it for the state, and for parameters, at most three times a second each,
+//! however many requests there are; after a set once more.
 //!
 //! ```text
 //! browser ── GET /api/stream ──► stream: state, log ◄── cache ◄── thread `snapshots` ──► Source::snapshot
@@ -23,6 +24,7 @@
 //! | `assets` | the files of the page |
 //! | `auth`, `request` | the token, and which request is refused, and why |
 //! | `cache` | the thread that asks, and the latest snapshot |
+//! | `listed` | the latest list of parameters |
 //! | `answer`, `body`, `server` | answers, connections and their limits |
 
 mod answer;
@@ -33,6 +35,7 @@ mod cache;
 mod decimate;
 mod events;
 mod fields;
+mod listed;
 mod look;
 mod metrics;
 mod model;

@@ -122,20 +122,22 @@ impl Shared {
         }
     }
 
-    /// Hands the new points and, where they are due, the tables to the streams. A stream that is full misses them.
+    /// Hands the new points and, where they are due, the tables to the streams. A stream that is full gets them later.
     fn publish(&self, now: Time, offset_s: f64, faults: &[String]) {
         for page in self.lock().pages.values_mut().filter(|page| !page.scope.look().apps.is_empty()) {
-            if page.events.capacity() == 0 {
+            // The room comes first: points without room wait for the next time, and are counted if they are too many.
+            let Ok(room) = page.events.try_reserve() else { continue };
+            match page.scope.points(now, offset_s) {
+                Some(points) => room.send(event("points", &points)),
+                None => drop(room),
+            }
+            if now < page.table_due {
                 continue;
             }
-            if let Some(points) = page.scope.points(now, offset_s) {
-                let _ = page.events.try_send(event("points", &points));
-            }
-            if now >= page.table_due && page.events.capacity() > 0 {
-                page.table_due = now + TABLE_PERIOD;
-                page.scope.set_faults(faults);
-                let _ = page.events.try_send(event("messages", &page.scope.table(now)));
-            }
+            let Ok(room) = page.events.try_reserve() else { continue };
+            page.table_due = now + TABLE_PERIOD;
+            page.scope.set_faults(faults);
+            room.send(event("messages", &page.scope.table(now)));
         }
     }
 }

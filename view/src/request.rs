@@ -1,6 +1,6 @@
 //! Checks requests. Any website can make a browser send requests to this host, by a name that it points here, or with
 //! an address of this host. So only a request with a `Host` of this host is answered. All but the metrics need the
-//! token, and one that writes or opens a stream has to come from the page itself.
+//! token, and one that asks the nodes or writes has to come from the page itself.
 
 use std::net::IpAddr;
 
@@ -117,15 +117,18 @@ pub(crate) fn document(head: Head<'_>, access: Access<'_>) -> Result<Document, R
     if !access.token.is_in(head.headers, access.cookie) {
         return Err(RequestError::NoToken);
     }
+    // A request that asks the nodes comes from the page alone. Browsers send no `Origin` with most that only read.
+    let writes = path == "/api/parameters" && *head.method == Method::POST;
+    if path.starts_with("/api/") {
+        check_site(head.headers, &host, writes)?;
+    }
     match path {
         "/api/stream" => {
             check_get(head)?;
-            check_site(head.headers, &host, head.headers.contains_key(ORIGIN))?;
             let query = head.uri.query().unwrap_or_default();
             Look::of_query(query).map(Document::Stream).ok_or(RequestError::Query)
         }
-        "/api/parameters" if *head.method == Method::POST => {
-            check_site(head.headers, &host, true)?;
+        "/api/parameters" if writes => {
             if head.headers.get(CONTENT_TYPE).is_none_or(|found| found != "application/json") {
                 return Err(RequestError::NoJson);
             }

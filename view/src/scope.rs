@@ -166,6 +166,14 @@ mod tests {
     }
 
     #[test]
+    fn value_without_a_number_is_null() {
+        let mut scope = Scope::new(look("app=hip&series=hip%09knee%09exo.angle%09angle"));
+        scope.take(&seen("hip", 1, &payload(f64::NAN)));
+        let points = scope.points(Time::from_nanos(40 * MS), 0.0).expect("a gap");
+        assert_eq!(points[0]["v"], json!([null]));
+    }
+
+    #[test]
     fn messages_of_other_applications_are_ignored() {
         let mut scope = Scope::new(look("app=hip"));
         scope.take(&seen("ankle", 1, &payload(1.0)));

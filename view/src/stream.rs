@@ -2,7 +2,7 @@
 
 use std::{
     sync::{
-        Arc,
+        Arc, Mutex, PoisonError,
         atomic::{AtomicBool, Ordering},
     },
     time::Duration,
@@ -18,12 +18,8 @@ use tokio::{
 };
 
 use crate::{
-    answer::Shared,
-    body::event,
-    cache::PAGE_FRESH,
-    look::Look,
-    model,
-    pages::{PageGuard, wall_s},
+    answer::Shared, body::event, cache::PAGE_FRESH, events::EventLog, look::Look, model, pages::wall_s,
+    snapshot::Snapshot,
 };
 
 /// Events that wait for a page.
@@ -50,6 +46,27 @@ impl Line {
     }
 }
 
+/// The event of the latest snapshot. All pages share it, so that a further page costs little.
+#[derive(Debug, Default)]
+pub(crate) struct States(Mutex<Option<(Arc<Snapshot>, Bytes)>>);
+
+impl States {
+    /// Returns the event of a snapshot. The first call for it looks for changes, too.
+    fn event(&self, snapshot: &Arc<Snapshot>, log: &mut EventLog) -> Bytes {
+        let mut latest = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some((of, event)) = &*latest
+            && Arc::ptr_eq(of, snapshot)
+        {
+            return event.clone();
+        }
+        let wall_ms = (wall_s() * 1e3) as u64;
+        log.observe(snapshot, wall_ms);
+        let event = event("state", &model::state(snapshot, wall_ms));
+        *latest = Some((Arc::clone(snapshot), event.clone()));
+        event
+    }
+}
+
 /// Opens the stream of a page; `None` if there are as many as may be.
 pub(crate) fn open(shared: &Arc<Shared>, line: &Arc<Line>, look: Look) -> Option<Receiver<Bytes>> {
     let (events, received) = channel(WAITING_MAX);
@@ -57,7 +74,13 @@ pub(crate) fn open(shared: &Arc<Shared>, line: &Arc<Line>, look: Look) -> Option
     line.is_stream.store(true, Ordering::Relaxed);
     let (shared, line) = (Arc::clone(shared), Arc::clone(line));
     tokio::spawn(async move {
-        if send_states(&shared, &events, guard).await == End::Stuck {
+        // A page that has gone ends it at once, also while the nodes are asked.
+        let end = tokio::select! {
+            end = send_states(&shared, &events) => end,
+            () = events.closed() => End::Closed,
+        };
+        drop(guard);
+        if end == End::Stuck {
             line.cut.notify_one();
         }
     });
@@ -73,17 +96,12 @@ enum End {
     Stuck,
 }
 
-async fn send_states(shared: &Shared, events: &Sender<Bytes>, _guard: PageGuard) -> End {
+async fn send_states(shared: &Shared, events: &Sender<Bytes>) -> End {
     let mut last = 0;
     loop {
         let Some(snapshot) = shared.cache.snapshot(PAGE_FRESH).await else { return End::Closed };
-        let wall_ms = (wall_s() * 1e3) as u64;
-        let new = {
-            let mut log = shared.log();
-            log.observe(&snapshot, wall_ms);
-            log.after(last)
-        };
-        let mut parts = vec![event("state", &model::state(&snapshot, wall_ms))];
+        let mut parts = vec![shared.states.event(&snapshot, &mut shared.log())];
+        let new = shared.log().after(last);
         if let Some(event_last) = new.last() {
             last = event_last.number;
             parts.push(event("log", &serde_json::json!(new)));
@@ -102,25 +120,46 @@ async fn send_states(shared: &Shared, events: &Sender<Bytes>, _guard: PageGuard)
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{cache::Cache, events::EventLog, pages::Pages, source::NoSystem};
+    use crate::metrics::tests::{lost, snapshot};
 
-    fn shared() -> Shared {
-        let source: Arc<dyn crate::source::Source> = Arc::new(NoSystem);
-        let cache = Cache::start(Arc::clone(&source), Duration::ZERO).expect("a thread");
-        let pages = Pages::start(Arc::clone(&source)).expect("a thread");
-        Shared::new(source, cache, pages, EventLog::default())
+    #[test]
+    fn pages_share_the_event_of_a_snapshot() {
+        let (states, mut log) = (States::default(), EventLog::default());
+        let first = Arc::new(snapshot());
+        let [one, other] = [0, 1].map(|_| states.event(&first, &mut log));
+        assert_eq!(one.as_ptr(), other.as_ptr());
+        let mut next = snapshot();
+        let gone = next.nodes.pop().expect("the knee").node;
+        let Ok(entry) = &mut next.entry else { panic!("it has answered") };
+        entry.lost.push(lost(gone, "knee", "crashed"));
+        assert_ne!(states.event(&Arc::new(next), &mut log), one);
+        assert!(!log.after(0).is_empty(), "the change is an event");
     }
 
     #[test]
     fn page_that_reads_nothing_is_cut_off() {
         let runtime = tokio::runtime::Builder::new_current_thread().enable_time().start_paused(true).build();
         runtime.expect("a runtime").block_on(async {
-            let shared = Arc::new(shared());
+            let shared = Shared::without_system();
             let line = Arc::new(Line::default());
             let received = open(&shared, &line, Look::default()).expect("there is room");
             line.cut().await;
             assert!(line.is_stream());
             drop(received);
+        });
+    }
+
+    #[test]
+    fn page_that_has_gone_gives_its_place_back() {
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_time().start_paused(true).build();
+        runtime.expect("a runtime").block_on(async {
+            let shared = Shared::without_system();
+            let open = || open(&shared, &Arc::new(Line::default()), Look::default());
+            let mut pages: Vec<_> = std::iter::from_fn(open).collect();
+            assert!(pages.pop().is_some() && open().is_none());
+            // No snapshot comes before this: only the other tasks run.
+            tokio::task::yield_now().await;
+            assert!(open().is_some());
         });
     }
 }

@@ -2,7 +2,7 @@
 
 use std::{collections::BTreeMap, path::Path, time::Duration};
 
-use sinew_record::{AskRecord, Channel, Entry, MessageEntry, RecordReport, Selection};
+use sinew_record::{AskRecord, Channel, Entry, Form, MessageEntry, RecordReport, Selection};
 use sinew_runtime::{tid::Tid, time::Time, wire::Header};
 use sinew_shm::journal::{JournalReader, ReadJournalError, Start};
 
@@ -63,6 +63,8 @@ pub struct Seen<'m> {
     pub length: usize,
     /// Its payload; empty if the node had only its length.
     pub payload: &'m [u8],
+    /// Whether this is the copy of its sender. If its destination is on another node, that node has a copy, too.
+    pub is_sent: bool,
     /// Whether it was rejected.
     pub is_rejected: bool,
     /// The names that are known.
@@ -123,7 +125,7 @@ impl<C: Connection> Follower<C> {
             let Some(record) = self.reader.next(now.as_nanos(), &mut self.buffer)? else { break };
             // A record of a newer version, or a fact, is no message.
             let Ok(Entry::Message(message)) = Entry::read(&self.buffer) else { continue };
-            let MessageEntry { header, length, payload, refused, .. } = message;
+            let MessageEntry { form, header, length, payload, refused } = message;
             if own.contains(&header.source) || own.contains(&header.destination) {
                 continue;
             }
@@ -133,9 +135,10 @@ impl<C: Connection> Follower<C> {
                 None => channel_of(&self.reader, &mut self.channels, record.place)?
                     .map_or(header.destination, |channel| channel.destination),
             };
-            let (at, is_rejected) = (Time::from_nanos(record.time), refused.is_some());
+            let at = Time::from_nanos(record.time);
+            let (is_sent, is_rejected) = (form == Form::Sent, refused.is_some());
             let (payload, names) = (payload.unwrap_or_default(), &self.names);
-            take(&Seen { at, header, destination, length, payload, is_rejected, names });
+            take(&Seen { at, header, destination, length, payload, is_sent, is_rejected, names });
         }
         Ok(())
     }
@@ -150,6 +153,11 @@ impl<C: Connection> Follower<C> {
         let report = ask(&mut self.connection, &self.question, RENEWED_WITHIN)?;
         self.renewal = Time::now() + RENEWAL;
         self.names.learn(&report, &[]);
+        // The lease had ended, for example because this program was stopped: the node has begun another journal.
+        if self.reader.is_closed()? {
+            self.reader = open(&report)?;
+            self.channels.clear();
+        }
         Ok(())
     }
 }

@@ -399,10 +399,9 @@ pub(super) fn ask_spans(system: &mut System, nodes: Vec<(NodeAddress, String)>) 
     let mut answers = system.ask_these::<AskFrozen, FrozenReport>(nodes);
     for answer in &mut answers {
         if answer.result.as_ref().is_ok_and(|report| report.refused.as_deref() == Some(FROZEN_BUSY)) {
-            answer.result = ask(system, answer.node, &AskFrozen::default()).map_err(|error| match error {
+            answer.result = ask(system, answer.node, &AskFrozen::default()).map_err(|error| {
                 // The line of a node begins with its address.
-                SystemError::NoAnswer(_, why) => why,
-                error => error.to_string(),
+                if let SystemError::NoAnswer(_, why) = error { why } else { error.to_string() }
             });
         }
     }

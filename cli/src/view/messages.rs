@@ -43,6 +43,8 @@ pub(super) struct Messages {
     apps: BTreeSet<String>,
     /// The applications that were found.
     found: BTreeMap<String, Tid>,
+    /// Their addresses.
+    read: BTreeSet<Tid>,
     /// Applications that were not found, and nodes that refuse, with the reason.
     faults: BTreeMap<String, String>,
     resolve_due: Time,
@@ -50,6 +52,9 @@ pub(super) struct Messages {
     journals: BTreeMap<NodeAddress, Follower<Own>>,
     /// Nodes with a journal out of reach.
     others: BTreeSet<NodeAddress>,
+    /// Those that gave no answer: they are asked again after the next look at the addresses, since nothing else is read
+    /// meanwhile.
+    silent: BTreeSet<NodeAddress>,
 }
 
 /// The connection to a node of this host.
@@ -95,11 +100,13 @@ impl Messages {
             system: None,
             apps: BTreeSet::new(),
             found: BTreeMap::new(),
+            read: BTreeSet::new(),
             faults: BTreeMap::new(),
             resolve_due: now,
             watch_due: now,
             journals: BTreeMap::new(),
             others: BTreeSet::new(),
+            silent: BTreeSet::new(),
         }
     }
 
@@ -107,6 +114,7 @@ impl Messages {
     fn resolve(&mut self, now: Time) -> Result<(), String> {
         self.resolve_due = now + RESOLVED_EVERY;
         self.faults.clear();
+        self.silent.clear();
         let mut system = match self.system.take() {
             Some(system) => system,
             None => self.entry.enter(self.within)?,
@@ -116,7 +124,8 @@ impl Messages {
             self.entry.leave(system);
             return Err(why);
         }
-        let nodes: BTreeSet<_> = self.found.values().map(|tid| tid.node).collect();
+        self.read = self.found.values().copied().collect();
+        let nodes: BTreeSet<_> = self.read.iter().map(|tid| tid.node).collect();
         self.journals.retain(|node, _| nodes.contains(node));
         self.others.retain(|node| nodes.contains(node));
         for node in nodes {
@@ -172,17 +181,27 @@ impl Messages {
 
     fn read_journals(&mut self, take: &mut dyn FnMut(&Sighting<'_>)) {
         let names = self.entry.names();
-        let faults = &mut self.faults;
+        let (faults, read) = (&mut self.faults, &self.read);
         self.journals.retain(|node, journal| {
-            let polled = journal.poll(&mut |seen| hand_over(seen, &names, take));
+            let polled = journal.poll(&mut |seen| {
+                // The journal of a node has one copy of a message between two of its applications.
+                if seen.destination.node == *node
+                    || !has_another_copy(seen.is_sent && !seen.is_rejected, seen.destination, read)
+                {
+                    hand_over(seen, &names, take);
+                }
+            });
             polled.map_err(|why| faults.insert(node.to_string(), why.to_string())).is_ok()
         });
     }
 
     fn ask_others(&mut self, take: &mut dyn FnMut(&Sighting<'_>)) {
         let Some(system) = &mut self.system else { return };
-        let names = self.entry.names();
+        let (names, read) = (self.entry.names(), &self.read);
         for (app, tid) in self.found.iter().filter(|(_, tid)| self.others.contains(&tid.node)) {
+            if self.silent.contains(&tid.node) {
+                continue;
+            }
             let question = AskWatch { app: *tid, received: true, sent: true };
             let to = Tid::new(tid.node, AppAddress::INSPECT);
             for _ in 0..WATCHED_MAX {
@@ -190,12 +209,20 @@ impl Messages {
                 let report = match asked {
                     Ok(WatchReport { refused: Some(why), .. }) => Err(why),
                     Ok(report) => Ok(report),
-                    Err(why) => Err(in_words(&why)),
+                    Err(why) => {
+                        self.silent.insert(tid.node);
+                        Err(in_words(&why))
+                    }
                 };
                 match report {
                     Ok(report) => {
                         let now = Time::now();
-                        report.seen.iter().for_each(|seen| show_watched(seen, now, &names, take));
+                        let shown = |seen: &&SeenMessage| {
+                            !has_another_copy(seen.is_sent && seen.refused.is_none(), seen.target, read)
+                        };
+                        report.seen.iter().filter(shown).for_each(|seen| {
+                            show_watched(seen, now, &names, take);
+                        });
                         if !report.more {
                             break;
                         }
@@ -252,6 +279,12 @@ fn discard(system: &mut System) {
     }
 }
 
+/// Returns whether a copy of the sender has another one at the destination, which is read: that one has the age of the
+/// message, and the sender's is left out. A message that was rejected at its sender has none.
+fn has_another_copy(has_left: bool, destination: Tid, read: &BTreeSet<Tid>) -> bool {
+    has_left && read.contains(&destination)
+}
+
 /// Returns the name of an address, or its text.
 fn name_of(tid: Tid, names: &Names) -> String {
     names.get(&tid).cloned().unwrap_or_else(|| tid.to_string())
@@ -292,6 +325,17 @@ mod tests {
     use sinew::message::{Class, Kind};
 
     use super::*;
+
+    #[test]
+    fn message_between_chosen_applications_is_shown_once() {
+        let [sender, receiver] =
+            [0x0a00_0001, 0x0a00_0002].map(|node| Tid::new(NodeAddress::new(node), AppAddress::new(0x1001)));
+        let (both, one) = (BTreeSet::from([sender, receiver]), BTreeSet::from([sender]));
+        let copies = |read| [true, false].map(|has_left| !has_another_copy(has_left, receiver, read));
+        assert_eq!(copies(&both), [false, true]);
+        // Only the sender's node is asked.
+        assert!(copies(&one)[0]);
+    }
 
     #[test]
     fn watched_message_has_a_time_of_this_host() {

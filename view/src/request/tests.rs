@@ -155,13 +155,12 @@ fn streams_are_for_the_page_with_legal_queries() {
     assert!(matches!(open("/api/stream?app=hip", &[]), Ok(Document::Stream(_))));
     assert_eq!(open("/api/stream?x=1", &[]), Err(RequestError::Query));
     let other = [(ORIGIN, "http://evil.example")];
-    assert_eq!(open("/api/stream", &other), Err(RequestError::OtherSite));
-    for site in ["cross-site", "same-site", "none"] {
-        assert_eq!(
-            open("/api/stream", &[(HeaderName::from_static(FETCH_SITE), site)]),
-            Err(RequestError::OtherSite),
-            "{site}"
-        );
+    for path in ["/api/stream", "/api/parameters"] {
+        assert_eq!(open(path, &other), Err(RequestError::OtherSite), "{path}");
+        for site in ["cross-site", "same-site", "none"] {
+            let stated = [(HeaderName::from_static(FETCH_SITE), site)];
+            assert_eq!(open(path, &stated), Err(RequestError::OtherSite), "{path} {site}");
+        }
     }
 }
 

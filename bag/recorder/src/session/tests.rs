@@ -79,9 +79,13 @@ impl Node {
     fn new(name: &str) -> Self {
         let folder = std::env::temp_dir().join(format!("sinew-session-{name}-{}", std::process::id()));
         fs::create_dir_all(&folder).unwrap();
-        let options = Options { ring_bytes: 64 * 1024, ..Options::default() };
-        let journal = Journal::create(&folder.join("node.journal"), &options).unwrap();
+        let journal = Self::journal(&folder);
         Self { folder, journal, asked: Arc::default() }
+    }
+
+    fn journal(folder: &Path) -> Journal {
+        let options = Options { ring_bytes: 64 * 1024, ..Options::default() };
+        Journal::create(&folder.join("node.journal"), &options).unwrap()
     }
 
     fn link(&self) -> Link {
@@ -272,6 +276,7 @@ fn follower_hands_over_messages_and_writes_no_file() {
     let mut seen = Vec::new();
     follower
         .poll(&mut |message| {
+            assert!(message.is_sent);
             let name = message.names.type_name(message.header.kind).map(str::to_owned);
             seen.push((message.header.sequence, message.destination, name, message.payload.to_vec()));
         })
@@ -286,4 +291,19 @@ fn follower_hands_over_messages_and_writes_no_file() {
     drop(follower.finish());
     assert!(lock(&node.asked).last().is_some_and(|question| question.ends && question.counts.is_none()));
     assert!(!node.folder.join("leg.mcap").exists());
+}
+
+#[test]
+fn follower_reads_the_journal_that_replaces_a_closed_one() {
+    let mut node = Node::new("replaced");
+    let mut follower = Follower::begin(node.link(), Selection::default()).unwrap();
+    let [angle, _] = kinds();
+    node.write(angle, 1);
+    // When: the node closes its journal, and begins another one for the next question
+    node.journal = Node::journal(&node.folder);
+    follower.select(Selection { apps: vec!["knee".to_owned()], ..Selection::default() }).unwrap();
+    node.write(angle, 2);
+    let mut seen = Vec::new();
+    follower.poll(&mut |message| seen.push(message.header.sequence)).unwrap();
+    assert_eq!(seen, [2]);
 }
