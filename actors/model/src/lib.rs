@@ -47,6 +47,7 @@ pub mod log_quotas;
 pub mod nearest;
 pub mod notifications;
 pub mod periodic_checks;
+pub mod ping;
 pub mod ports;
 pub mod progress;
 pub mod rate_limiter;

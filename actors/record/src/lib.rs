@@ -32,7 +32,8 @@ pub use frozen::{
 };
 pub use outcome::OutcomeEntry;
 pub use question::{
-    AskRecord, CLOCKS_MAX, RECORDED_MAX, RecordCounts, RecordReport, RecordedApp, RecordedType, SCHEMAS_MAX,
+    AskRecord, CLOCKS_MAX, RECORDED_MAX, RecordCounts, RecordReport, RecordedApp, RecordedType,
+    RecordingReport, SCHEMAS_MAX,
 };
 pub use selection::{Chosen, Selection, SelectionError};
 pub use tap::{OutcomeTap, RecordTap, lost_channel};

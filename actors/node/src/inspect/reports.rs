@@ -10,7 +10,6 @@ mod peers;
 mod reach;
 mod real_time;
 mod record;
-mod recording;
 mod refused;
 mod security;
 mod tree;
@@ -28,7 +27,6 @@ pub use peers::{
 };
 pub use reach::{AskGroups, AskReach, GroupReport, REACHED_MAX, ReachReport, Reached};
 pub use real_time::RealTimeReport;
-pub use recording::RecordingReport;
 pub use refused::{LostEchoReport, RefusalReport, UnguardedReport, UnhandledReport};
 pub use security::{CertificateReport, SecurityReport};
 pub use tree::{AskTree, TREE_MAX, TreeLine, TreeReport};
@@ -37,13 +35,14 @@ pub use types::{
 };
 pub use watch::{AskWatch, SEEN_BYTES_MAX, SEEN_MAX, SeenMessage, WatchReport};
 
-use serde::{Deserialize, Serialize};
+use serde::Serialize;
+pub use sinew_model::ping::Ping;
 pub use sinew_record::{
     AskFreeze, AskFrozen, AskRecord, FROZEN_BUSY, FROZEN_BYTES_MAX, FROZEN_SPANS_MAX, FreezeReport,
     FrozenFacts, FrozenPart, FrozenReport, FrozenSpan, RECORDED_MAX, RecordCounts, RecordReport, RecordedApp,
-    RecordedType, SCHEMAS_MAX,
+    RecordedType, RecordingReport, SCHEMAS_MAX,
 };
-use sinew_runtime::wire::{Class, Payload, encode};
+use sinew_runtime::wire::{Class, encode};
 
 /// Maximum number of lost nodes, causes of refusals, or barriers in one answer.
 pub(super) const LISTED_MAX: usize = 64;
@@ -51,25 +50,6 @@ pub(super) const LISTED_MAX: usize = 64;
 pub(super) const GROUPS_OF_APPS_MAX: usize = 256;
 /// Maximum number of names that one application lacks: the maximum that it may require.
 pub(super) const MISSING_MAX: usize = 64;
-
-/// Asks for a sign of life, confirmed: the receiver need not know this type.
-///
-/// # Examples
-///
-/// ```
-/// use sinew::{Endpoint, Outcome, Tid, client::ApiError, inspect::Ping, prelude::*};
-///
-/// fn lives(endpoint: &mut Endpoint, app: Tid) -> Result<bool, ApiError> {
-///     let outcome = endpoint.message(app, &Ping {}).confirmed(Duration::from_millis(100))?;
-///     Ok(outcome == Outcome::Delivered)
-/// }
-/// ```
-#[derive(Clone, Copy, Debug, Default, Serialize, Deserialize)]
-pub struct Ping {}
-
-impl Payload for Ping {
-    const NAME: &'static str = "sinew.ping";
-}
 
 /// An answer with lists, from which entries that do not fit are left out.
 pub(super) trait Report {

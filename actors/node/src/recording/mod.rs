@@ -26,7 +26,7 @@ use std::{
 
 use rustix::time::{ClockId, clock_gettime};
 use sinew_model::context::NodeContext;
-use sinew_record::{NodeFact, OutcomeTap, RecordCounts, RecordTap, Selection};
+use sinew_record::{NodeFact, OutcomeTap, RecordCounts, RecordTap, RecordingReport, Selection};
 use sinew_runtime::{
     log::{self, LogObserver},
     outcome::{self, OutcomeObserver},
@@ -43,7 +43,7 @@ pub(crate) use flight::Flight;
 pub(crate) use names::{journal_kinds, report};
 pub(crate) use triggers::Triggers;
 
-use crate::{NodeState, inspect::RecordingReport};
+use crate::NodeState;
 
 /// Time without a question after which a recording ends that a program asked for.
 pub(crate) const LEASE: Duration = Duration::from_secs(5);

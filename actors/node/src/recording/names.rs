@@ -6,6 +6,7 @@ use sinew_lncl::undelivered::kind_name;
 use sinew_model::{
     barrier::{ArriveAtBarrier, BarrierAnswer, LeaveBarrier},
     directory::DirectoryEntry,
+    ping::Ping,
 };
 use sinew_record::{Channel, RecordReport, RecordedApp, RecordedType};
 use sinew_runtime::{
@@ -17,7 +18,7 @@ use sinew_runtime::{
 use sinew_shm::journal::{JournalReader, Start};
 
 use super::{facts::clocks, wall_offset};
-use crate::{NodeState, inspect::Ping};
+use crate::NodeState;
 
 /// Maximum number of payload types with a structure beside a journal. A reader without a node cannot ask for more.
 const READER_SCHEMAS_MAX: usize = 256;
