@@ -150,8 +150,8 @@ fn node_at(address: &str) -> usize {
     last.and_then(|last| last.checked_sub(1)).unwrap_or_else(|| panic!("{address:?} is no host's"))
 }
 
-/// Reads a file: its stamps, and its metadata records. The messages are in the order of their times.
-fn read(path: &Path) -> (Vec<Merged>, BTreeMap<String, BTreeMap<String, String>>) {
+/// Reads a file: the stamps of a merged one, in the order of their times, and the metadata records.
+fn read(path: &Path, is_merged: bool) -> (Vec<Merged>, BTreeMap<String, BTreeMap<String, String>>) {
     let mut reader = Reader::open(path).expect("it can be opened");
     let (mut stamps, mut metadata, mut last_ns) = (Vec::new(), BTreeMap::new(), 0);
     while let Some(item) = reader.next_item().expect("it is whole") {
@@ -161,7 +161,6 @@ fn read(path: &Path) -> (Vec<Merged>, BTreeMap<String, BTreeMap<String, String>>
             }
             Item::Message(message) => {
                 let channel = &message.channel;
-                let is_merged = !channel.value("node").is_empty();
                 assert!(!is_merged || message.log_ns >= last_ns, "{}: {}", channel.topic, message.log_ns);
                 last_ns = message.log_ns;
                 let is_stamp = channel.role() == Role::Raw && channel.value("type") == "scenario.stamp";
@@ -183,7 +182,7 @@ fn read(path: &Path) -> (Vec<Merged>, BTreeMap<String, BTreeMap<String, String>>
 /// Returns the wall clock of each node minus its monotonic clock, as its own file states it.
 fn wall_offsets(robot: &Robot) -> [i64; 3] {
     [0, 1, 2].map(|host| {
-        let (_, metadata) = read(&robot.file(host));
+        let (_, metadata) = read(&robot.file(host), false);
         metadata["sinew"]["wall_offset_ns"].parse().expect("a number")
     })
 }
@@ -251,7 +250,7 @@ fn hosts_with_different_clocks_have_one_time_line() {
         assert!(wrong.abs() < SECOND, "the wall clock of {} is wrong by {wrong} ns", NAMES[host]);
     }
     // And: the stated bounds are smaller than that
-    let (merged, metadata) = read(&out);
+    let (merged, metadata) = read(&out, true);
     let bounds = [1, 2, 3].map(|host| {
         let text = &metadata["sinew.merged"][&format!("bound_ns 10.77.0.{host}")];
         text.parse::<i64>().expect("a number")
