@@ -190,7 +190,8 @@ impl<R: Read> Reader<R> {
         ))
     }
 
-    /// Returns the time from the first message of the file, as text. That is the one at `first_ns` if none was read yet.
+    /// Returns the time from the first message of the file, as text. That is the one at `first_ns` if none was read
+    /// yet.
     fn offset(&self, at_ns: u64, first_ns: u64) -> String {
         let first_ns = self.times.map_or(first_ns, |(first_ns, _)| first_ns);
         let offset = Duration::from_nanos(at_ns.saturating_sub(first_ns));

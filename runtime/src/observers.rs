@@ -15,8 +15,8 @@ const OBSERVERS_MAX: usize = 64;
 /// The observers, some of which may have been dropped.
 pub(crate) struct Observers<T: ?Sized + 'static> {
     list: ArcSwapOption<Vec<Weak<T>>>,
-    /// Whether there may be one. SYNC: Relaxed; the list has its own order, and an observer that is just being added may
-    /// miss an event.
+    /// Whether there may be one. SYNC: Relaxed; the list has its own order, and an observer that is just being added
+    /// may miss an event.
     is_used: AtomicBool,
     /// Held while the list is replaced.
     change: Mutex<()>,
