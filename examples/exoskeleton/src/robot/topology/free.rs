@@ -11,16 +11,23 @@ use sinew::NodeAddress;
 
 use super::{Control, ControlThread, Discovery, DrivePlace, NodePlace, PlantPlace, ReleaseBy, Topology};
 
+/// The first of the ports that are tried. The system gives none of them to a socket that asks for any port
+/// (`net.ipv4.ip_local_port_range` of Linux begins at 32,768), so no node takes one by chance before it is used.
+const FIRST_PORT: u16 = 20_000;
+/// Number of these ports.
+const PORTS: u16 = 10_000;
+/// Number of ports that are tried.
+const TRIES: u16 = 100;
+
 /// A topology on loopback with a project name, a multicast port, a plant port and sockets of its own.
 ///
 /// # Errors
-/// The system has no free UDP port.
+/// None of the tried UDP ports is free.
 pub fn for_this_host(seed: u64) -> io::Result<Topology> {
     let id = std::process::id();
     // Both are held at once, so that they differ. If another process takes one before the nodes do, they
     // report that at their start.
-    let free_port = || UdpSocket::bind((Ipv4Addr::LOCALHOST, 0));
-    let (query, plant) = (free_port()?, free_port()?);
+    let (query, plant) = (free_port(id)?, free_port(id)?);
     let group = Ipv4Addr::new(239, 255, (id >> 8) as u8, id as u8);
     let node = |part, last| NodePlace {
         address: NodeAddress::from([127, 0, 0, last]),
@@ -51,6 +58,20 @@ pub fn for_this_host(seed: u64) -> io::Result<Topology> {
             .map(|(joint, last)| node(Part::Joint(joint), last)),
         plant: PlantPlace { address: plant.local_addr()?, device_watchdog: None, seed, trial: None },
     })
+}
+
+/// Returns a socket with a free UDP port. Runs that start one after another try different ones first.
+fn free_port(id: u32) -> io::Result<UdpSocket> {
+    let first = (id % u32::from(PORTS / 2)) as u16 * 2;
+    let ports = (0..TRIES).map(|number| FIRST_PORT + (first + number) % PORTS);
+    let mut result = Err(io::ErrorKind::AddrInUse.into());
+    for port in ports {
+        result = UdpSocket::bind((Ipv4Addr::LOCALHOST, port));
+        if result.is_ok() {
+            break;
+        }
+    }
+    result
 }
 
 /// `sinew` finds `/tmp/sinew-*.sock` by itself. Not in the run folder: the path of a socket has at most 107
