@@ -190,9 +190,10 @@ impl<S: Socket> WriterState<S> {
         outcome: Outcome,
         deferred: &mut DeferredActions,
     ) -> bool {
-        let is_added = self.numbering.combines_outcomes()
-            && !self.link_frames.is_finishing()
-            && self.unsent.queue.extend_outcome(ticket, outcome, outcomes::frame_max(self.payload_max));
+        let Some(link) = self.numbering.outcomes_header() else { return false };
+        let max = outcomes::frame_max(link.kind, self.payload_max);
+        let is_added =
+            !self.link_frames.is_finishing() && self.unsent.queue.extend_outcome(ticket, outcome, max);
         if is_added {
             self.help(deferred);
         }
