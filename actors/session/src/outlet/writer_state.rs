@@ -350,9 +350,13 @@ impl<S: Socket> WriterState<S> {
         if !self.connection.is_present(link) {
             return false;
         }
+        let had_frame = self.has_frame();
         let Some(effect) = self.numbering.on_ack(ack) else { return false };
         self.unsent.on_held(ack);
-        self.connection.wake_drainer(deferred);
+        // A frame that could be written before has its wake. In a flood another one for each ACK would end its delay.
+        if !had_frame && self.has_frame() || !matches!(effect, AckEffect::Known) {
+            self.connection.wake_drainer(deferred);
+        }
         match effect {
             AckEffect::Known => false,
             AckEffect::Resumed => {
