@@ -195,6 +195,7 @@ impl<S: Socket> WriterState<S> {
         let is_added =
             !self.link_frames.is_finishing() && self.unsent.queue.extend_outcome(ticket, outcome, max);
         if is_added {
+            self.connection.joins_delayed();
             self.help(deferred);
         }
         is_added
