@@ -80,11 +80,15 @@ pub(super) struct Open {
     all: Mutex<Outstanding>,
     /// The number of these messages.
     count: AtomicUsize,
+    /// While there are fewer, no destination is at its bound.
+    always_open: usize,
 }
 
 impl Open {
     pub(super) fn new(shares: Shares) -> Self {
-        Self { all: Mutex::new(Outstanding::new(shares)), count: AtomicUsize::new(0) }
+        let all = Outstanding::new(shares);
+        let always_open = all.share_of_one().min(all.room_for_all());
+        Self { all: Mutex::new(all), count: AtomicUsize::new(0), always_open }
     }
 
     /// Calls the method of this name of [`Outstanding`], as do the following methods.
@@ -151,8 +155,10 @@ impl Open {
         self.with(|all| all.wake_if_fewer_open(deferred));
     }
 
+    /// Only the thread with the outlet's lock adds messages, so that others can only make the answer `false`. Most often
+    /// it needs no lock.
     pub(super) fn is_at_bound(&self, destination: Tid) -> bool {
-        self.with(|all| all.is_at_bound(destination))
+        self.len() >= self.always_open && self.with(|all| all.is_at_bound(destination))
     }
 
     /// Registers a sender that found too many pending outcomes of this destination. It is woken when there
@@ -353,7 +359,7 @@ impl Outstanding {
     /// Returns how many more outcomes may be pending in total. Without a session, each destination's bound is
     /// also the bound of all.
     fn room_for_all(&self) -> usize {
-        let bound = UNCONFIRMED_DESTINATIONS * self.shares.unconfirmed_max;
+        let bound = UNCONFIRMED_DESTINATIONS.saturating_mul(self.shares.unconfirmed_max);
         let bound = self.shares.outcome_room.map_or(usize::MAX, |there| bound.min(there));
         bound.saturating_sub(self.open())
     }

@@ -138,6 +138,41 @@ fn run_settles_each_correlation_once_and_in_any_order() {
 }
 
 #[test]
+fn bound_without_the_lock_is_the_bound_under_it() {
+    for (unconfirmed_max, outcome_room) in [
+        (0, None),
+        (1, None),
+        (5, None),
+        (5, Some(0)),
+        (5, Some(1)),
+        (5, Some(16)),
+        (5, Some(1_000)),
+        (1, Some(80)),
+    ] {
+        let open = Open::new(Shares { unconfirmed_max, outcome_room });
+        for count in 0..100 {
+            for to in [1, 2, 3] {
+                let expected = lock(&open).is_at_bound(tid(to));
+                assert_eq!(
+                    open.is_at_bound(tid(to)),
+                    expected,
+                    "{count} of {unconfirmed_max}, {outcome_room:?}"
+                );
+            }
+            open.add_waiting(Some(tid(1 + count % 2)));
+            let ticket =
+                Ticket { source: tid(0), destination: tid(1 + count % 2), correlation: count.into() };
+            let receipt = Receipt::new(Arc::<NullSink>::default(), ticket);
+            assert!(open.sent(SentMessage { receipt, expiry: Time::MAX, written: 0 }).is_none());
+        }
+    }
+}
+
+fn lock(open: &Open) -> std::sync::MutexGuard<'_, Outstanding> {
+    open.all.lock().unwrap()
+}
+
+#[test]
 fn silent_destinations_leave_no_state() {
     let sent: Vec<_> = (0..10_000).map(|to| (to, Some(1))).collect();
     let mut outstanding = outstanding(&sent);
