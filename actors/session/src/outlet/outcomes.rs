@@ -70,7 +70,8 @@ pub fn read(kind: Kind, payload: &[u8]) -> Option<impl Iterator<Item = ReportedO
     if !entries.remainder().is_empty() || entries.len() > OUTCOMES_MAX {
         return None;
     }
-    let all = entries.clone().try_fold(0, |sum, entry| Some(sum + usize::from(read_one(entry)?.count)))?;
+    let all =
+        entries.clone().try_fold(0_usize, |sum, entry| Some(sum + usize::from(read_one(entry)?.count)))?;
     (1..=OUTCOMES_MAX).contains(&all).then(|| entries.filter_map(read_one))
 }
 
@@ -184,7 +185,9 @@ pub(super) fn with_outcomes_behind(
         return first;
     };
     shorten(&mut first, max, queue, counters);
-    let (mut room, waiting) = (max - count(&first), count(&first) + queue.outcomes());
+    let entries =
+        if link.kind == Kind::GNCL_OUTCOME_RUNS { 1 + queue.len() } else { count(&first) + queue.outcomes() };
+    let mut room = max - count(&first);
     let mut next = |room: usize| {
         let fits = |next: &Message| is_of(next, &link) && count(next) <= room;
         if room > 0 { queue.pop_if(Class::Control, fits) } else { None }
@@ -193,7 +196,6 @@ pub(super) fn with_outcomes_behind(
     if second.is_none() && count(&first) == 1 {
         return first;
     }
-    let entries = if link.kind == Kind::GNCL_OUTCOME_RUNS { 1 + queue.len() } else { waiting };
     let mut payload = Vec::with_capacity(entry_len(link.kind) * max.min(entries));
     write(&first, link.kind, &mut payload);
     while let Some(behind) = second {
