@@ -11,7 +11,8 @@
 //! ```
 //!
 //! An entry of OUTCOME_RUNS is the outcome of `count` messages, from `correlation` on. A frame has the outcomes of at
-//! most 128 messages. The nodes are those of the link, so a peer cannot report the outcome of a message to another node.
+//! most 128 messages. The nodes are those of the link, so a peer cannot report the outcome of a message to another
+//! node.
 //!
 //! In the queue a run of outcomes is one message: equal ones of messages with consecutive correlations from one
 //! application to another. In a flood nearly all outcomes are added to such a run, and are no messages of their own.

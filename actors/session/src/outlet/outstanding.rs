@@ -155,8 +155,8 @@ impl Open {
         self.with(|all| all.wake_if_fewer_open(deferred));
     }
 
-    /// Only the thread with the outlet's lock adds messages, so that others can only make the answer `false`. Most often
-    /// it needs no lock.
+    /// Whether this destination can have no further message. Only the thread with the outlet's lock adds messages, so
+    /// that others can only make the answer `false`. Most often it needs no lock.
     pub(super) fn is_at_bound(&self, destination: Tid) -> bool {
         self.len() >= self.always_open && self.with(|all| all.is_at_bound(destination))
     }
