@@ -116,8 +116,10 @@ mod tests {
             let one = ticket(first.wrapping_add(at));
             prop_assert_eq!(run.settle(one), at < u64::from(count));
             prop_assert!(!run.settle(one));
-            prop_assert!(!run.settle(Ticket { source: one.destination, ..one }));
-            prop_assert!(!run.settle(Ticket { destination: one.source, ..one }));
+            let other_source = Ticket { source: one.destination, ..one };
+            let other_destination = Ticket { destination: one.source, ..one };
+            prop_assert!(!run.settle(other_source));
+            prop_assert!(!run.settle(other_destination));
             let others = (0..u64::from(count)).filter(|other| *other != at).map(|other| first + other);
             prop_assert_eq!(correlations(&run), others.collect::<Vec<_>>());
         }
