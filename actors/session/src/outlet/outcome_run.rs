@@ -86,7 +86,7 @@ impl OutcomeRun {
     pub(super) fn tickets(&self) -> impl Iterator<Item = Ticket> {
         let Self { first, left, .. } = *self;
         (0..u128::BITS)
-            .filter(move |at| left & 1 << at != 0)
+            .filter(move |at| left & (1_u128 << *at) != 0)
             .map(move |at| Ticket { correlation: first.correlation + u64::from(at), ..first })
     }
 }

@@ -44,7 +44,7 @@ fn runs() -> impl Strategy<Value = Vec<ReportedOutcome>> {
             room = left.unwrap_or(0);
             left.is_some()
         };
-        runs.take_while(fits).collect()
+        runs.take_while(fits).collect::<Vec<_>>()
     })
 }
 
@@ -102,7 +102,7 @@ proptest! {
         for count in [0, 129 + over] {
             let mut payload = frame.payload.to_vec();
             payload[entry * RUN + EACH] = count;
-            prop_assert!(read(Kind::GNCL_OUTCOME_RUNS, &payload).is_none(), "a run of {count}");
+            prop_assert!(read(Kind::GNCL_OUTCOME_RUNS, &payload).is_none(), "a run of {}", count);
         }
     }
 }
