@@ -187,6 +187,12 @@ pub trait ReceiptSink: Send + Sync {
     /// Accepts the outcome of the message of `ticket`. Called once for each receipt.
     fn settle(&self, ticket: Ticket, outcome: Outcome);
 
+    /// Accepts the outcomes of several messages, as [`settle`](Self::settle) does for each, in this order. A message
+    /// that is not taken from `outcomes` counts as not settled.
+    fn settle_all(&self, outcomes: &mut dyn Iterator<Item = (Ticket, Outcome)>) {
+        outcomes.for_each(|(ticket, outcome)| self.settle(ticket, outcome));
+    }
+
     /// Accepts reports about the members of the message to many of `ticket`, before it is settled. spec: FRAME-7
     fn members(&self, ticket: Ticket, reports: &[MemberReport]) {
         let _ = (ticket, reports);
@@ -218,14 +224,38 @@ impl Receipt {
         self.settle_once(outcome);
     }
 
-    /// Settles the message, unless it is settled. It counts as settled before its sink is called, which may
-    /// panic.
+    /// Settles all messages in order, and empties `receipts`. The sink of several in a row gets these together.
+    pub fn settle_all(receipts: &mut Vec<(Self, Outcome)>) {
+        for same in receipts.chunk_by_mut(|(one, _), (next, _)| Arc::ptr_eq(&one.sink, &next.sink)) {
+            match same {
+                [(receipt, outcome)] => receipt.settle_once(*outcome),
+                [(first, _), ..] => {
+                    let sink = first.sink.clone();
+                    let mut outcomes = same.iter_mut().filter_map(|(receipt, outcome)| {
+                        receipt.begin_settlement().map(|ticket| (ticket, *outcome))
+                    });
+                    sink.settle_all(&mut outcomes);
+                }
+                // A chunk has at least one.
+                [] => {}
+            }
+        }
+        receipts.clear();
+    }
+
+    /// Settles the message, unless it is settled.
     fn settle_once(&mut self, outcome: Outcome) {
-        let ticket = self.ticket;
-        self.ticket.source = SETTLED;
-        if ticket.source != SETTLED {
+        if let Some(ticket) = self.begin_settlement() {
             self.sink.settle(ticket, outcome);
         }
+    }
+
+    /// Returns the ticket of a message that is not settled. It counts as settled before its sink is called, which may
+    /// panic.
+    fn begin_settlement(&mut self) -> Option<Ticket> {
+        let ticket = self.ticket;
+        self.ticket.source = SETTLED;
+        (ticket.source != SETTLED).then_some(ticket)
     }
 
     /// Reports members of the message, which must be one to many.
@@ -297,6 +327,50 @@ mod tests {
         let receipt = Receipt::new(sink.clone(), TICKET);
         assert!(catch_unwind(AssertUnwindSafe(|| receipt.settle(Outcome::Delivered))).is_err());
         assert_eq!(*sink.0.lock().unwrap_or_else(PoisonError::into_inner), 1);
+    }
+
+    #[test]
+    fn receipts_settle_together_in_order_and_once() {
+        let ledgers = [Arc::<Ledger>::default(), Arc::default()];
+        let all =
+            [(0, Outcome::Delivered), (0, Outcome::Expired), (1, Outcome::Failed), (0, Outcome::Unknown)];
+        let mut receipts: Vec<_> =
+            all.iter().map(|(to, outcome)| (Receipt::new(ledgers[*to].clone(), TICKET), *outcome)).collect();
+        Receipt::settle_all(&mut receipts);
+        assert!(receipts.is_empty());
+        let expected = [vec![Outcome::Delivered, Outcome::Expired, Outcome::Unknown], vec![Outcome::Failed]];
+        assert_eq!(ledgers.map(|ledger| ledger.0.lock().unwrap().clone()), expected);
+    }
+
+    #[test]
+    fn receipts_behind_a_panic_or_left_by_the_sink_say_failed() {
+        #[derive(Default)]
+        struct TakesOne {
+            panics: bool,
+            seen: Mutex<Vec<(u64, Outcome)>>,
+        }
+
+        impl ReceiptSink for TakesOne {
+            fn settle(&self, ticket: Ticket, outcome: Outcome) {
+                self.seen.lock().unwrap().push((ticket.correlation, outcome));
+            }
+
+            fn settle_all(&self, outcomes: &mut dyn Iterator<Item = (Ticket, Outcome)>) {
+                let (ticket, outcome) = outcomes.next().expect("there are several");
+                self.settle(ticket, outcome);
+                assert!(!self.panics, "a fault of the sink's");
+            }
+        }
+
+        for panics in [false, true] {
+            let sink = Arc::new(TakesOne { panics, ..TakesOne::default() });
+            let receipt = |correlation| Receipt::new(sink.clone(), Ticket { correlation, ..TICKET });
+            let mut receipts: Vec<_> = (1..=3).map(|n| (receipt(n), Outcome::Delivered)).collect();
+            let settled = catch_unwind(AssertUnwindSafe(move || Receipt::settle_all(&mut receipts)));
+            assert_eq!(settled.is_err(), panics);
+            let expected = [(1, Outcome::Delivered), (2, Outcome::Failed), (3, Outcome::Failed)];
+            assert_eq!(*sink.seen.lock().unwrap(), expected);
+        }
     }
 
     #[test]

@@ -24,6 +24,8 @@ use crate::{
 /// Maximum number of recorded cancellations of requests to one application. Beyond it the oldest is removed,
 /// and only the deadline of that request shows that it is no longer awaited.
 const CANCELLED_MAX: usize = 1_024;
+/// Maximum number of outcomes that are settled under one lock: more would make the application wait for the lock.
+const SETTLED_TOGETHER: usize = 32;
 
 /// The table of an application's waits, and of cancelled requests to it. It outlives the application's incarnations.
 #[derive(Debug)]
@@ -187,26 +189,48 @@ impl Pending {
     }
 
     fn settle_with(&self, id: u64, from: Tid, settlement: Settlement) {
-        let waker = {
-            let mut inner = lock(&self.inner);
-            let Some(slot) = inner.slots.get_mut(&id) else {
-                // The wait was closed: the deadline passed, or the requesting incarnation has ended.
-                inner.late += u64::from(matches!(settlement, Settlement::Reply(_)));
-                return;
-            };
-            let is_answer = match (&settlement, slot.awaited) {
-                (Settlement::Outcome(_), Awaited::Outcome) | (Settlement::Reply(_), Awaited::Reply) => true,
-                (Settlement::Outcome(outcome), Awaited::Reply) => *outcome != Outcome::Delivered,
-                (Settlement::Reply(_), Awaited::Outcome) => false,
-            };
-            // Only the destination may answer.
-            if !is_answer || slot.from != from || slot.settled.is_some() {
-                return;
-            }
-            slot.settled = Some(settlement);
-            slot.waker.take()
-        };
+        // A refused result is dropped without the lock: a reply may have a receipt.
+        let mut settlement = Some(settlement);
+        let waker = lock(&self.inner).settle(id, from, &mut settlement);
         waker.into_iter().for_each(wakes::wake);
+    }
+
+    /// Settles these messages under one lock, then wakes those that wait for them.
+    fn settle_together(&self, outcomes: &[Option<(Ticket, Outcome)>; SETTLED_TOGETHER]) {
+        let mut wakers = [const { None }; SETTLED_TOGETHER];
+        {
+            let mut inner = lock(&self.inner);
+            for ((ticket, outcome), waker) in outcomes.iter().flatten().zip(&mut wakers) {
+                let mut settlement = Some(Settlement::Outcome(*outcome));
+                *waker = inner.settle(ticket.correlation, ticket.destination, &mut settlement);
+            }
+        }
+        let _batch = wakes::Batch::begin();
+        wakers.into_iter().flatten().for_each(wakes::wake);
+    }
+}
+
+impl Inner {
+    /// Takes a result for the wait of this number, if it has none and may be ended by this one of `from`. Returns the
+    /// waker of the wait.
+    fn settle(&mut self, id: u64, from: Tid, settlement: &mut Option<Settlement>) -> Option<Waker> {
+        let Some(slot) = self.slots.get_mut(&id) else {
+            // The wait was closed: the deadline passed, or the requesting incarnation has ended.
+            self.late += u64::from(matches!(settlement, Some(Settlement::Reply(_))));
+            return None;
+        };
+        let is_answer = match (&*settlement, slot.awaited) {
+            (Some(Settlement::Outcome(_)), Awaited::Outcome)
+            | (Some(Settlement::Reply(_)), Awaited::Reply) => true,
+            (Some(Settlement::Outcome(outcome)), Awaited::Reply) => *outcome != Outcome::Delivered,
+            (Some(Settlement::Reply(_)), Awaited::Outcome) | (None, _) => false,
+        };
+        // Only the destination may answer.
+        if !is_answer || slot.from != from || slot.settled.is_some() {
+            return None;
+        }
+        slot.settled = settlement.take();
+        slot.waker.take()
     }
 }
 
@@ -214,6 +238,21 @@ impl ReceiptSink for Pending {
     fn settle(&self, ticket: Ticket, outcome: Outcome) {
         outcome::show(ticket, outcome);
         self.settle_with(ticket.correlation, ticket.destination, Settlement::Outcome(outcome));
+    }
+
+    fn settle_all(&self, outcomes: &mut dyn Iterator<Item = (Ticket, Outcome)>) {
+        loop {
+            let mut together = [const { None }; SETTLED_TOGETHER];
+            for (place, (ticket, outcome)) in together.iter_mut().zip(&mut *outcomes) {
+                // Observers are called without the lock, and before the application can see the outcome.
+                outcome::show(ticket, outcome);
+                *place = Some((ticket, outcome));
+            }
+            self.settle_together(&together);
+            if together.last().is_none_or(Option::is_none) {
+                return;
+            }
+        }
     }
 
     fn members(&self, ticket: Ticket, reports: &[MemberReport]) {
@@ -349,6 +388,28 @@ mod tests {
         assert!(poll(&wait).is_pending());
         pending.settle(ticket(&wait), Outcome::Failed);
         assert!(matches!(poll(&wait), Poll::Ready(Settlement::Outcome(Outcome::Failed))));
+    }
+
+    #[test]
+    fn outcomes_settle_together_as_one_by_one() {
+        for count in [1, SETTLED_TOGETHER, SETTLED_TOGETHER + 1, 3 * SETTLED_TOGETHER] {
+            let pending = Pending::new(count);
+            let waits: Vec<_> =
+                (0..count).map(|_| pending.open(Awaited::Outcome, Tid::NONE).unwrap()).collect();
+            let outcomes = [Outcome::Delivered, Outcome::Failed, Outcome::Expired];
+            let outcomes: Vec<_> = waits.iter().map(ticket).zip(outcomes.into_iter().cycle()).collect();
+            let foreign = (Ticket { destination: Tid::from_bits(7), ..ticket(&waits[0]) }, Outcome::Unknown);
+            // One of another destination, and each twice: the first counts.
+            let again = outcomes.iter().map(|(ticket, _)| (*ticket, Outcome::Unknown));
+            let mut all = std::iter::once(foreign).chain(outcomes.iter().copied()).chain(again);
+            pending.settle_all(&mut all);
+            assert!(all.next().is_none());
+            for (wait, (_, expected)) in waits.iter().zip(&outcomes) {
+                assert!(
+                    matches!(poll(wait), Poll::Ready(Settlement::Outcome(outcome)) if outcome == *expected)
+                );
+            }
+        }
     }
 
     #[test]

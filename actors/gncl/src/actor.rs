@@ -38,8 +38,8 @@ use super::{
     authenticator::Authenticator,
     connection_events::ConnectionEvents,
     core::{
-        Attach, CANCEL, CLASSES, ConnectionId, Core, DATAGRAMS, GUARD, Input, Introduction, Lane, OUTCOMES,
-        Output, Settings, UNDELIVERED, write,
+        Attach, CANCEL, CLASSES, ConnectionId, Core, DATAGRAMS, GUARD, Input, Introduction, Lane,
+        OUTCOME_RUNS, OUTCOMES, Output, Settings, UNDELIVERED, write,
     },
     datagram_reader,
     frame::frame,
@@ -281,7 +281,7 @@ pub fn settings(
     let NodeConfig { name, project, payload_max, gncl, ndl, .. } = config.clone();
     // Security protects connections only; a datagram would be sent unprotected.
     let datagrams = (gncl.datagrams && !has_keys).then_some(DATAGRAMS);
-    let features = [CLASSES, CANCEL, GUARD, OUTCOMES, UNDELIVERED].into_iter().chain(datagrams);
+    let features = [CLASSES, CANCEL, GUARD, OUTCOMES, OUTCOME_RUNS, UNDELIVERED].into_iter().chain(datagrams);
     Settings {
         ours: Introduction {
             project,

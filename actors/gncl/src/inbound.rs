@@ -16,7 +16,7 @@ use sinew_runtime::{
 };
 use sinew_session::{
     Ack,
-    outlet::{LinkNumber, OUTCOMES_MAX, backlog_key, read_outcomes},
+    outlet::{LinkNumber, OUTCOMES_MAX, OutcomeRun, backlog_key, read_outcomes},
 };
 
 use super::{
@@ -45,9 +45,27 @@ pub(super) struct Inbound {
     pub(super) checksum: Checksum,
     /// Outcomes that the peer reported in this [`Batch`] and that are not settled yet: at most
     /// [`OUTCOMES_BATCH_MAX`] and those of one frame.
-    pub(super) outcomes: RefCell<Vec<(Ticket, Outcome)>>,
+    pub(super) outcomes: RefCell<PendingOutcomes>,
     /// The conversion of the peer's times, once a message of this [`Batch`] has needed it.
     pub(super) conversion: Cell<Option<Conversion>>,
+}
+
+/// Outcomes that are settled together.
+#[derive(Default)]
+pub(super) struct PendingOutcomes {
+    runs: Vec<OutcomeRun>,
+    /// The number of their messages.
+    messages: usize,
+}
+
+impl PendingOutcomes {
+    /// Adds outcomes, to those right before them if they can be one run.
+    fn add(&mut self, run: OutcomeRun) {
+        self.messages += run.len();
+        if !self.runs.last_mut().is_some_and(|last| last.extend(&run)) {
+            self.runs.push(run);
+        }
+    }
 }
 
 /// A conversion of the peer's times, for messages that are received at this time. `None` if the peer's clock is not
@@ -120,7 +138,9 @@ impl Inbound {
         let guard = session.processing_guard();
         let disposition = if is_for_the_link(&message, Kind::GNCL_VOID) {
             Some(Disposition::Void)
-        } else if is_for_the_link(&message, Kind::GNCL_OUTCOMES) {
+        } else if is_for_the_link(&message, Kind::GNCL_OUTCOMES)
+            || is_for_the_link(&message, Kind::GNCL_OUTCOME_RUNS)
+        {
             self.on_outcomes(now, &message)?;
             Some(Disposition::Consumed)
         } else {
@@ -345,29 +365,29 @@ impl Inbound {
         };
         match outcome {
             // An outcome that is not pending any more was settled as Unknown when an earlier connection ended.
-            Some(outcome) => self.outcomes.borrow_mut().push((about(&message.header), outcome)),
+            Some(outcome) => {
+                self.outcomes.borrow_mut().add(OutcomeRun::new(about(&message.header), 1, outcome));
+            }
             None => self.count(now, "no such outcome", message),
         }
     }
 
     /// Processes several outcomes in one frame; an unknown code affects only its own entry. spec: GNCL-17
     fn on_outcomes(&self, now: Time, message: &Message) -> Result<(), RefusalError> {
-        let Some(all) = read_outcomes(&message.payload) else {
+        let Header { kind, .. } = message.header;
+        let Some(all) = read_outcomes(kind, &message.payload) else {
             let length = message.payload.len();
             return Err(RefusalError::Violation(format!(
-                "OUTCOMES of {length} bytes are not 1 to {OUTCOMES_MAX}"
+                "{length} bytes in a frame of kind {kind} are not outcomes of 1 to {OUTCOMES_MAX} messages"
             )));
         };
         for reported in all {
-            match reported.outcome {
-                Some(outcome) => {
-                    let ticket = reported.ticket(self.state.ctx.node, self.peer.node);
-                    self.outcomes.borrow_mut().push((ticket, outcome));
-                }
+            match reported.run(self.state.ctx.node, self.peer.node) {
+                Some(run) => self.outcomes.borrow_mut().add(run),
                 None => self.count(now, "no such outcome", message),
             }
         }
-        if self.outcomes.borrow().len() >= OUTCOMES_BATCH_MAX {
+        if self.outcomes.borrow().messages >= OUTCOMES_BATCH_MAX {
             self.settle_outcomes();
         }
         Ok(())
@@ -375,13 +395,13 @@ impl Inbound {
 
     /// Settles the received outcomes. The notified code finds nothing borrowed here.
     fn settle_outcomes(&self) {
-        if self.outcomes.borrow().is_empty() {
+        if self.outcomes.borrow().messages == 0 {
             return;
         }
-        let mut outcomes = self.outcomes.take();
-        self.peer.confirm(&mut outcomes);
-        outcomes.clear();
-        self.outcomes.replace(outcomes);
+        let mut runs = self.outcomes.take().runs;
+        self.peer.confirm(&mut runs);
+        runs.clear();
+        self.outcomes.replace(PendingOutcomes { runs, messages: 0 });
     }
 
     fn count(&self, now: Time, cause: &'static str, message: &Message) {

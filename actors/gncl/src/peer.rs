@@ -22,7 +22,7 @@ use sinew_runtime::{
 };
 use sinew_session::{
     counts::Account,
-    outlet::{OutletAccount, OutletCounts},
+    outlet::{OutcomeRun, OutletAccount, OutletCounts},
 };
 use tokio::sync::Notify;
 
@@ -87,7 +87,7 @@ impl Peer {
         let parameters = SessionParameters {
             here: state.ctx.node,
             node: attach.node,
-            takes_outcomes: attach.takes_outcomes,
+            outcomes_kind: outcomes_kind(attach),
             peer_answers_max: usize::try_from(attach.answers_max).unwrap_or(usize::MAX),
             peer_payload_max: usize::try_from(attach.payload_max).unwrap_or(usize::MAX),
             sessions,
@@ -237,8 +237,8 @@ impl Peer {
         self.end(Rejection::Closed);
     }
 
-    /// Processes the peer's outcomes of these messages. Outcomes that are not pending stay in `outcomes`.
-    pub(super) fn confirm(&self, outcomes: &mut Vec<(Ticket, Outcome)>) {
+    /// Processes the peer's outcomes of these messages. Runs with messages that are not pending stay in `outcomes`.
+    pub(super) fn confirm(&self, outcomes: &mut Vec<OutcomeRun>) {
         // A ticket does not name the class.
         self.sessions.iter().for_each(|session| session.outlet.confirm_all(outcomes));
     }
@@ -325,6 +325,17 @@ impl ReceiptSink for Peer {
             frame.header.sent = Time::now();
             session.send_reports(frame);
         }
+    }
+}
+
+/// Returns the kind of a frame with several outcomes that the peer accepts; of two the shorter one. spec: GNCL-17
+const fn outcomes_kind(attach: &Attach) -> Option<Kind> {
+    if attach.takes_outcome_runs {
+        Some(Kind::GNCL_OUTCOME_RUNS)
+    } else if attach.takes_outcomes {
+        Some(Kind::GNCL_OUTCOMES)
+    } else {
+        None
     }
 }
 

@@ -158,8 +158,8 @@ pub struct SessionAccount {
 pub(super) struct SessionParameters {
     pub(super) here: NodeAddress,
     pub(super) node: NodeAddress,
-    /// Whether the peer accepts several outcomes in one frame.
-    pub(super) takes_outcomes: bool,
+    /// The kind of a frame with several outcomes, if the peer accepts one.
+    pub(super) outcomes_kind: Option<Kind>,
     /// Maximum number of this session's confirmed messages for which the peer has room for outcomes.
     pub(super) peer_answers_max: usize,
     /// Longest payload that the peer accepts.
@@ -220,7 +220,7 @@ impl PeerSession {
         let receiver_id = now.as_nanos();
         let header = |kind| frame(parameters.here, parameters.node, kind, Bytes::new()).header;
         let void = header(Kind::GNCL_VOID);
-        let outcomes = parameters.takes_outcomes.then(|| header(Kind::GNCL_OUTCOMES));
+        let outcomes = parameters.outcomes_kind.map(header);
         let session =
             Session::new(receiver_id, window, void, outcomes).answered_up_to(parameters.peer_answers_max);
         let outlet = SocketWriter::with_session(limits, session);

@@ -30,6 +30,7 @@ mod draining;
 pub mod fuzzing;
 mod link_frames;
 mod numbering;
+mod outcome_run;
 mod outcomes;
 mod outstanding;
 mod partial;
@@ -66,6 +67,7 @@ pub use batch::Gathering;
 use deferred::DeferredActions;
 use draining::Drained;
 pub use numbering::Session;
+pub use outcome_run::OutcomeRun;
 pub use outcomes::{OUTCOMES_MAX, read as read_outcomes};
 use outstanding::{OUTCOME_GRACE, Open};
 pub use progress::Taking;
@@ -382,9 +384,9 @@ impl<S: Socket> SocketWriter<S> {
         was_pending
     }
 
-    /// Same as [`confirm`](Self::confirm), for several outcomes under one lock. Outcomes that were not
+    /// Same as [`confirm`](Self::confirm), for several outcomes under one lock. Runs with messages that were not
     /// pending stay in `outcomes`.
-    pub fn confirm_all(&self, outcomes: &mut Vec<(Ticket, Outcome)>) {
+    pub fn confirm_all(&self, outcomes: &mut Vec<OutcomeRun>) {
         if !outcomes.is_empty() {
             let mut deferred = DeferredActions::default();
             self.open.confirm_all(outcomes, &mut deferred);

@@ -64,6 +64,8 @@ impl Kind {
     pub const GNCL_DATAGRAMS: Self = Self(0x19);
     /// Unconfirmed messages of the receiver's applications that its sender rejected.
     pub const GNCL_UNDELIVERED: Self = Self(0x1a);
+    /// Runs of outcomes of confirmed messages.
+    pub const GNCL_OUTCOME_RUNS: Self = Self(0x1b);
     /// A query for present nodes, or whether a known node is alive.
     pub const NDL_QUERY: Self = Self(0x20);
     /// The matched answer.

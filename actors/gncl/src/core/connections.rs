@@ -14,8 +14,8 @@ use sinew_runtime::{
 };
 
 use super::{
-    Attach, CANCEL, Connection, ConnectionId, Core, DATAGRAMS, GUARD, Introduction, Lane, OUTCOMES, Output,
-    Refusal, RefusalError, Stage, UNDELIVERED,
+    Attach, CANCEL, Connection, ConnectionId, Core, DATAGRAMS, GUARD, Introduction, Lane, OUTCOME_RUNS,
+    OUTCOMES, Output, Refusal, RefusalError, Stage, UNDELIVERED,
     dials::Dial,
     handshake::{check, printable},
     lane_connections::LaneConnection,
@@ -347,6 +347,7 @@ impl Core {
             by_class,
             takes_cancels: theirs.supports(CANCEL),
             takes_outcomes: theirs.supports(OUTCOMES),
+            takes_outcome_runs: theirs.supports(OUTCOME_RUNS),
             takes_reports: theirs.supports(UNDELIVERED),
             takes_datagrams: by_class && theirs.supports(DATAGRAMS) && self.settings.ours.supports(DATAGRAMS),
             is_guarded: theirs.supports(GUARD) && self.settings.ours.supports(GUARD),

@@ -54,7 +54,9 @@ fn ours() -> Introduction {
         dial: 0,
         payload_max: 1 << 20,
         answers_max: 8_192,
-        features: [CLASSES, CANCEL, GUARD, OUTCOMES, DATAGRAMS, UNDELIVERED].map(str::to_owned).into(),
+        features: [CLASSES, CANCEL, GUARD, OUTCOMES, OUTCOME_RUNS, DATAGRAMS, UNDELIVERED]
+            .map(str::to_owned)
+            .into(),
         lane: Lane::Control,
         link: 0,
         datagrams_made: 0,
@@ -192,7 +194,8 @@ impl Play<'_> {
     fn introduction(&mut self) -> Introduction {
         let (node, incarnation) = self.node_incarnation();
         let (dial, link, bits) = (self.script.number(), self.script.byte(), self.script.byte());
-        let abilities = [CLASSES, CANCEL, GUARD, OUTCOMES, DATAGRAMS, UNDELIVERED].into_iter().enumerate();
+        let abilities =
+            [CLASSES, CANCEL, GUARD, OUTCOMES, DATAGRAMS, UNDELIVERED, OUTCOME_RUNS].into_iter().enumerate();
         let has = |at: usize| bits & (1 << at) != 0;
         // A peer knows the number of an established link.
         let number = self.core.peers.get(&node).and_then(|peer| peer.link).map(|link| link.dial);

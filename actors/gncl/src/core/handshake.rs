@@ -31,6 +31,9 @@ pub const CANCEL: &str = "cancel";
 /// The feature of receiving several outcomes in one frame.
 pub const OUTCOMES: &str = "outcomes";
 
+/// The feature of receiving runs of outcomes.
+pub const OUTCOME_RUNS: &str = "outcome-runs";
+
 /// The feature of sending Stream values by datagram.
 pub const DATAGRAMS: &str = "datagrams-2";
 
@@ -81,7 +84,7 @@ pub struct Introduction {
     #[serde(default = "default_answers", skip_serializing_if = "is_default_answers")]
     pub answers_max: u64,
     /// Optional features of the sender. Features of both nodes may be used: [`CLASSES`], [`CANCEL`],
-    /// [`GUARD`], [`OUTCOMES`], [`DATAGRAMS`], [`UNDELIVERED`].
+    /// [`GUARD`], [`OUTCOMES`], [`OUTCOME_RUNS`], [`DATAGRAMS`], [`UNDELIVERED`].
     #[serde(default)]
     pub features: Vec<String>,
     /// The lane of this connection.

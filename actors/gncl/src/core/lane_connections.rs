@@ -11,8 +11,8 @@ use std::time::Duration;
 use sinew_runtime::{tid::NodeAddress, time::Time};
 
 use super::{
-    Attach, CANCEL, Connection, ConnectionId, Core, DATAGRAMS, GUARD, Introduction, Lane, OUTCOMES, Output,
-    RefusalError, Settings, Stage, UNDELIVERED,
+    Attach, CANCEL, Connection, ConnectionId, Core, DATAGRAMS, GUARD, Introduction, Lane, OUTCOME_RUNS,
+    OUTCOMES, Output, RefusalError, Settings, Stage, UNDELIVERED,
     handshake::check,
     peer_state::{Keepalive, Link},
 };
@@ -216,6 +216,7 @@ impl Core {
             by_class: true,
             takes_cancels: theirs.supports(CANCEL),
             takes_outcomes: theirs.supports(OUTCOMES),
+            takes_outcome_runs: theirs.supports(OUTCOME_RUNS),
             takes_reports: theirs.supports(UNDELIVERED),
             takes_datagrams: theirs.supports(DATAGRAMS) && self.settings.ours.supports(DATAGRAMS),
             is_guarded: theirs.supports(GUARD) && self.settings.ours.supports(GUARD),

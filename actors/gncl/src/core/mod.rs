@@ -35,8 +35,8 @@ use sinew_runtime::{
 
 use connections::{Clearing, FoundAt};
 pub use handshake::{
-    CANCEL, CLASSES, DATAGRAMS, GUARD, HANDSHAKE_PAYLOAD_MAX, Introduction, Lane, OUTCOMES, Refusal,
-    RefusalError, UNDELIVERED, read, write,
+    CANCEL, CLASSES, DATAGRAMS, GUARD, HANDSHAKE_PAYLOAD_MAX, Introduction, Lane, OUTCOME_RUNS, OUTCOMES,
+    Refusal, RefusalError, UNDELIVERED, read, write,
 };
 use peer_state::PeerState;
 use sinew_model::facts::LinkFact;
@@ -172,6 +172,8 @@ pub struct Attach {
     pub takes_cancels: bool,
     /// Whether the peer accepts several outcomes in one frame.
     pub takes_outcomes: bool,
+    /// Whether the peer accepts runs of outcomes.
+    pub takes_outcome_runs: bool,
     /// Whether the peer accepts reports of undelivered messages.
     pub takes_reports: bool,
     /// Whether values of class Stream may be sent by datagram.

@@ -211,6 +211,7 @@ impl Store {
             by_class: false,
             takes_cancels: true,
             takes_outcomes: true,
+            takes_outcome_runs: true,
             takes_reports: true,
             takes_datagrams: false,
             is_guarded: false,

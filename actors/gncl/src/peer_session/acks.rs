@@ -125,7 +125,7 @@ mod tests {
         let parameters = SessionParameters {
             here: HERE,
             node: NODE,
-            takes_outcomes: true,
+            outcomes_kind: Some(Kind::GNCL_OUTCOME_RUNS),
             peer_answers_max: 100,
             peer_payload_max: usize::MAX,
             sessions: 1,

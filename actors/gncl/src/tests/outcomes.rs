@@ -3,9 +3,10 @@
 use bytes::Bytes;
 use sinew_runtime::{
     outcome::{Outcome, ReceiptSink as _, Rejection, Ticket},
-    tid::{AppAddress, Tid},
+    tid::{AppAddress, NodeAddress, Tid},
     wire::{Kind, Message},
 };
+use sinew_session::outlet::read_outcomes;
 
 use super::{
     bench::{ByHand, NINE, Node, introduction, next, pair, run, within},
@@ -30,7 +31,18 @@ fn said(outcomes: &[(u64, u8)]) -> Message {
 }
 
 fn from_nine(payload: Vec<u8>) -> Message {
-    frame(NINE, sinew_runtime::tid::NodeAddress::new(1), Kind::GNCL_OUTCOMES, Bytes::from(payload))
+    frame(NINE, NodeAddress::new(1), Kind::GNCL_OUTCOMES, Bytes::from(payload))
+}
+
+/// Same as [`said`], with runs: the first correlation of each, its byte, and the number of its messages.
+fn runs(runs: &[(u64, u8, u8)]) -> Message {
+    let mut payload = Vec::new();
+    for (correlation, code, count) in runs {
+        payload.extend([0x01, 0x10, 0, 0, 0x01, 0x10, 0, 0]);
+        payload.extend(correlation.to_le_bytes());
+        payload.extend([*code, *count]);
+    }
+    frame(NINE, NodeAddress::new(1), Kind::GNCL_OUTCOME_RUNS, Bytes::from(payload))
 }
 
 /// Returns a node with a handwritten peer that has `count` confirmed messages of it, numbered from 1.
@@ -61,6 +73,48 @@ fn invalid_outcome_spoils_no_other_in_its_frame() {
 }
 
 #[test]
+fn run_settles_its_outstanding_messages_alone() {
+    run(async {
+        // The second run covers a message that has its outcome and many that were never sent; the third one has an
+        // unknown byte.
+        let (mut node, mut peer) = owing(6).await;
+        peer.send(&runs(&[(2, 0, 2), (1, 2, 100), (5, 200, 1)])).await;
+        peer.send(&said(&[(4, 0), (6, 20)])).await;
+        let failed = [(1, Outcome::Failed), (4, Outcome::Failed), (5, Outcome::Failed), (6, Outcome::Failed)];
+        let delivered = [(2, Outcome::Delivered), (3, Outcome::Delivered)];
+        for expected in delivered.into_iter().chain(failed) {
+            assert_eq!(next("an outcome", &mut node.settled).await, expected);
+        }
+        node.counted("no such outcome").await;
+        let peer = node.state.store.peer(NINE).expect("it is linked");
+        assert_eq!(peer.unconfirmed(), 0);
+    });
+}
+
+#[test]
+fn invalid_runs_end_the_connection() {
+    let mut truncated = runs(&[(1, 0, 1)]);
+    truncated.payload = truncated.payload.slice(..17);
+    let invalid = [
+        runs(&[]),
+        truncated,
+        runs(&[(1, 0, 0)]),
+        runs(&[(1, 0, 129)]),
+        runs(&[(1, 0, 255)]),
+        runs(&[(1, 0, 64), (65, 0, 65)]),
+        runs(&[(u64::MAX, 0, 2)]),
+    ];
+    for message in invalid {
+        run(async move {
+            let (_node, mut peer) = owing(1).await;
+            peer.send(&message).await;
+            let refusal = peer.refusal().await;
+            assert_eq!(refusal.cause, "violation", "{:?}: {refusal:?}", message.payload);
+        });
+    }
+}
+
+#[test]
 fn truncated_excessive_or_empty_outcomes_end_the_connection() {
     for length in [0, 16, 18, 17 * 129] {
         run(async move {
@@ -75,12 +129,13 @@ fn truncated_excessive_or_empty_outcomes_end_the_connection() {
 #[test]
 fn batched_outcomes_are_sent_only_if_supported() {
     run(async {
-        // Given: a peer that accepts single outcomes and one that accepts several, each of which has sent many
-        // confirmed messages.
-        for knows in [false, true] {
+        // Given: a peer that accepts single outcomes, one that accepts several and one that accepts runs, each of
+        // which has sent many confirmed messages.
+        let runs = (Some(Kind::GNCL_OUTCOME_RUNS), vec!["outcomes", "outcome-runs"]);
+        for (kind, features) in [(None, vec![]), (Some(Kind::GNCL_OUTCOMES), vec!["outcomes"]), runs] {
             let node = Node::start(1).await;
             let mut inbox = node.app(1);
-            let features = if knows { vec!["outcomes".to_owned()] } else { Vec::new() };
+            let features = features.into_iter().map(str::to_owned).collect();
             let mut peer =
                 ByHand::greeting(&node, &Introduction { features, ..introduction(node.address()) }).await;
             for correlation in 1..=64 {
@@ -98,17 +153,21 @@ fn batched_outcomes_are_sent_only_if_supported() {
             for mut message in taken {
                 message.settle(Outcome::Delivered);
             }
-            // Then: each outcome arrives once, and only one of them receives frames of several.
+            // Then: each outcome arrives once, and those of several in one frame in the form that the peer supports.
             let (mut reported, mut frames) = (0, 0);
             while reported < 64 {
                 let message = peer.receive().await;
                 frames += 1;
+                let outcomes = read_outcomes(message.header.kind, &message.payload);
                 reported += match message.header.kind {
-                    Kind::GNCL_OUTCOMES => message.payload.len() / 17,
-                    _ => 1,
+                    Kind::OUTCOME => 1,
+                    several => {
+                        assert_eq!(Some(several), kind);
+                        outcomes.expect("whole outcomes").map(|run| usize::from(run.count)).sum()
+                    }
                 };
             }
-            assert_eq!((reported, frames < 64), (64, knows), "{frames} frames");
+            assert_eq!((reported, frames < 64), (64, kind.is_some()), "{frames} frames");
         }
     });
 }

@@ -4,9 +4,9 @@
 //! and the message is sent when the call returns. This does not help a sender that repeatedly has the next
 //! message ready when the last write returns. From its fifth such message on, messages are gathered until
 //! there are many. The sender then copies them into one buffer and writes that. The drain task writes smaller
-//! amounts. It writes Bulk and outcomes after a [short delay](super::delayed_wake), so that neither side has
-//! to switch threads for each, and all else at once. A round trip never counts as a burst, because the answer
-//! takes longer than that.
+//! amounts. It writes Bulk and outcomes after a [short delay](super::delayed_wake), longer while many more
+//! come, so that neither side has to switch threads for each, and all else at once. A round trip never counts
+//! as a burst, because the answer takes longer than that.
 
 use std::{
     io::{self, IoSlice},
@@ -136,6 +136,14 @@ impl<S: Socket> Socket for Gathering<S> {
 
     fn wake_later(&mut self) -> bool {
         self.delayed_wake.wake_later()
+    }
+
+    fn joins_delayed(&mut self) {
+        self.delayed_wake.joined();
+    }
+
+    fn wrote_delayed(&mut self) {
+        self.delayed_wake.written();
     }
 
     fn poll_delayed_wake(&mut self, cx: &mut Context<'_>) {

@@ -185,6 +185,20 @@ impl<S: Socket> Connection<S> {
         if let Link::Up(socket) = &mut self.link { socket.wake_later() } else { false }
     }
 
+    /// Counts a message that was added to a queued one, which may postpone the delayed wake.
+    pub(super) fn joins_delayed(&mut self) {
+        if let Link::Up(socket) = &mut self.link {
+            socket.joins_delayed();
+        }
+    }
+
+    /// Records that a sender has written the queued messages.
+    pub(super) fn wrote_delayed(&mut self) {
+        if let Link::Up(socket) = &mut self.link {
+            socket.wrote_delayed();
+        }
+    }
+
     /// Keeps the waker of the drain task, if it has changed.
     pub(super) fn register_drainer(&mut self, waker: &Waker) {
         if !self.drainer.as_ref().is_some_and(|known| known.will_wake(waker)) {

@@ -47,9 +47,7 @@ impl DeferredActions {
     }
 
     fn run_all(mut self) {
-        for (receipt, outcome) in self.settle.drain(..) {
-            receipt.settle(outcome);
-        }
+        Receipt::settle_all(&mut self.settle);
         self.wake.into_iter().chain(self.room).for_each(wakes::wake);
         if (1..=KEPT_MAX).contains(&self.settle.capacity()) {
             // The settled code may have settled other receipts meanwhile, in memory of its own. One of the

@@ -1,5 +1,6 @@
 //! Delayed wake of the drain task, without a switch to its thread now: the sender of a burst has its next
-//! message ready earlier than that.
+//! message ready earlier than that. While many more come, the wake is postponed: the sender is about to write them all
+//! itself.
 
 use std::{
     io,
@@ -15,6 +16,12 @@ use tokio::{io::unix::AsyncFd, runtime::Handle};
 /// Delay in nanoseconds that lets more delayable messages arrive. Waking a thread on an idle CPU takes about
 /// half of it, and so does a write of 32 KiB.
 const WAKE_DELAY_NS: i64 = 50_000;
+/// Messages within a delay that postpone the wake by another delay: a call of the system for so many costs less than a
+/// wake, and fewer do not soon become as many as the sender [writes itself](super::draining).
+const JOINED: u32 = 16;
+/// Maximum number of delays by which a wake is postponed: the sender writes after as many messages. The first message
+/// waits for 400 us at most.
+const POSTPONED_MAX: u32 = 7;
 
 thread_local! {
     /// The calling thread: the standard library counts a reference for each question.
@@ -33,6 +40,7 @@ pub(super) struct DelayedWake {
 struct Timer {
     timer: AsyncFd<OwnedFd>,
     is_set: bool,
+    postponement: Postponement,
     /// The thread of the drain task. A sender on this thread needs no timer, because the drain task runs when
     /// the sender's task ends.
     drainer: ThreadId,
@@ -50,6 +58,20 @@ impl DelayedWake {
         }
     }
 
+    /// Counts a message that was added to one that waits for the wake.
+    pub(super) fn joined(&mut self) {
+        if let Some(timer) = self.timer.as_mut().filter(|timer| timer.is_set) {
+            timer.join();
+        }
+    }
+
+    /// Records that the sender has written the messages that waited for the wake: later ones may postpone it again.
+    pub(super) fn written(&mut self) {
+        if let Some(timer) = &mut self.timer {
+            timer.postponement = Postponement::default();
+        }
+    }
+
     /// Registers the awake drain task for the next wake.
     pub(super) fn poll(&mut self, cx: &mut Context<'_>) {
         if std::mem::take(&mut self.is_wanted) && Handle::try_current().is_ok() {
@@ -64,20 +86,36 @@ impl DelayedWake {
 
 impl Timer {
     fn new() -> io::Result<Self> {
-        Ok(Self { timer: kernel_timer()?, is_set: false, drainer: THREAD.with(|thread| *thread) })
+        let (timer, drainer) = (kernel_timer()?, THREAD.with(|thread| *thread));
+        Ok(Self { timer, is_set: false, postponement: Postponement::default(), drainer })
     }
 
     fn wake_later(&mut self) -> bool {
         if THREAD.with(|thread| *thread == self.drainer) {
             return false;
         }
-        if !self.is_set {
-            let never = Timespec { tv_sec: 0, tv_nsec: 0 };
-            let setting =
-                Itimerspec { it_interval: never, it_value: Timespec { tv_sec: 0, tv_nsec: WAKE_DELAY_NS } };
-            self.is_set = timerfd_settime(self.timer.get_ref(), TimerfdTimerFlags::empty(), &setting).is_ok();
+        if self.is_set {
+            self.join();
+        } else {
+            self.is_set = self.set();
+            self.postponement = Postponement::default();
         }
         self.is_set
+    }
+
+    fn join(&mut self) {
+        if self.postponement.join() {
+            // If this fails, the timer expires as it was set before.
+            self.set();
+        }
+    }
+
+    /// Sets the timer to one delay from now. Returns whether the system did.
+    fn set(&self) -> bool {
+        let never = Timespec { tv_sec: 0, tv_nsec: 0 };
+        let setting =
+            Itimerspec { it_interval: never, it_value: Timespec { tv_sec: 0, tv_nsec: WAKE_DELAY_NS } };
+        timerfd_settime(self.timer.get_ref(), TimerfdTimerFlags::empty(), &setting).is_ok()
     }
 
     fn poll(&mut self, cx: &mut Context<'_>) {
@@ -89,5 +127,36 @@ impl Timer {
                 Err(_) => return,
             }
         }
+    }
+}
+
+/// The messages that joined the first one, and the delays by which they postponed its wake.
+#[derive(Debug, Default)]
+struct Postponement {
+    joined: u32,
+    delays: u32,
+}
+
+impl Postponement {
+    /// Counts a message. Returns whether it postpones the wake.
+    const fn join(&mut self) -> bool {
+        self.joined = self.joined.saturating_add(1);
+        let postpones = self.joined == JOINED && self.delays < POSTPONED_MAX;
+        if postpones {
+            (self.joined, self.delays) = (0, self.delays + 1);
+        }
+        postpones
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn wake_is_postponed_a_bounded_number_of_times() {
+        let mut postponement = Postponement::default();
+        let postponed: Vec<u32> = (1..=1_000).filter(|_| postponement.join()).collect();
+        assert_eq!(postponed, (1..=POSTPONED_MAX).map(|delay| delay * JOINED).collect::<Vec<_>>());
     }
 }

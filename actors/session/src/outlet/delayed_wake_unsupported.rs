@@ -15,5 +15,13 @@ impl DelayedWake {
 
     /// Does nothing, because there is no timer.
     #[expect(clippy::unused_self, reason = "as where there is a timer")]
+    pub(super) fn joined(&mut self) {}
+
+    /// Does nothing, because there is no timer.
+    #[expect(clippy::unused_self, reason = "as where there is a timer")]
+    pub(super) fn written(&mut self) {}
+
+    /// Does nothing, because there is no timer.
+    #[expect(clippy::unused_self, reason = "as where there is a timer")]
     pub(super) fn poll(&mut self, _: &mut Context<'_>) {}
 }

@@ -88,6 +88,7 @@ impl<S: Socket> WriterState<S> {
             bytes += self.gather_next(deferred);
         }
         self.connection.write_gathered();
+        self.connection.wrote_delayed();
         self.bursts.written(Time::now());
     }
 

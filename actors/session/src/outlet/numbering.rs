@@ -19,7 +19,7 @@ pub struct Session {
     sending: Sending<Message>,
     /// The header of a void, which replaces a message that is not needed any more.
     void: Header,
-    /// The header of a frame with several outcomes, if the peer supports it.
+    /// The header of a frame with several outcomes, each alone or in runs, if the peer supports it.
     outcomes: Option<Header>,
     /// Maximum number of confirmed messages for which the peer has room for outcomes.
     pub(super) outcome_room: usize,
@@ -94,12 +94,6 @@ impl Numbering {
 
     pub(super) fn epoch(&self) -> u64 {
         self.0.as_ref().map_or(0, |session| session.sending.epoch())
-    }
-
-    /// Whether the peer accepts several outcomes in one frame.
-    #[inline]
-    pub(super) fn combines_outcomes(&self) -> bool {
-        self.0.as_ref().is_some_and(|session| session.outcomes.is_some())
     }
 
     /// Returns the header of a frame with several outcomes, if the peer supports it.

@@ -6,13 +6,16 @@
 //! and one place in the window.
 //!
 //! ```text
-//!  sent to (4)   sent by (4)   correlation (8)   outcome (1)      for each: 17 bytes, little-endian; 128 at most
+//!  sent to (4)   sent by (4)   correlation (8)   outcome (1)                OUTCOMES: 17 bytes, little-endian
+//!  sent to (4)   sent by (4)   correlation (8)   outcome (1)   count (1)    OUTCOME_RUNS: 18 bytes
 //! ```
 //!
-//! The nodes are those of the link, so a peer cannot report the outcome of a message to another node.
+//! An entry of OUTCOME_RUNS is the outcome of `count` messages, from `correlation` on. A frame has the outcomes of at
+//! most 128 messages. The nodes are those of the link, so a peer cannot report the outcome of a message to another
+//! node.
 //!
-//! In the queue a range of outcomes is one message: equal ones of messages with consecutive correlations from one
-//! application to another. In a flood nearly all outcomes are added to such a range, and are no messages of their own.
+//! In the queue a run of outcomes is one message: equal ones of messages with consecutive correlations from one
+//! application to another. In a flood nearly all outcomes are added to such a run, and are no messages of their own.
 
 use sinew_runtime::{
     outcome::{Outcome, Ticket},
@@ -20,51 +23,73 @@ use sinew_runtime::{
     wire::{Class, Header, Kind, Message},
 };
 
-use super::{account::Counters, queue::SendQueue};
+use super::{account::Counters, outcome_run::OutcomeRun, queue::SendQueue};
 
 /// Bytes of one outcome.
 const EACH: usize = 17;
-/// Maximum number of outcomes in one frame: the number that a sender writes itself at once.
+/// Bytes of one run of outcomes.
+const RUN: usize = EACH + 1;
+/// Maximum number of messages with an outcome in one frame: the number that a sender writes itself at once.
 pub const OUTCOMES_MAX: usize = 128;
 
-/// One outcome, as reported by a peer.
+/// One entry of a frame with outcomes, as reported by a peer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ReportedOutcome {
-    /// The application at the peer that the message was sent to.
+    /// The application at the peer that the messages were sent to.
     pub destination: AppAddress,
-    /// The application that has sent the message.
+    /// The application that has sent the messages.
     pub source: AppAddress,
+    /// The correlation of the first message.
     pub correlation: u64,
-    /// The outcome; `None` if its code is unknown.
+    /// The number of messages with consecutive correlations: 1 to [`OUTCOMES_MAX`].
+    pub count: u8,
+    /// The outcome of each; `None` if its code is unknown.
     pub outcome: Option<Outcome>,
 }
 
 impl ReportedOutcome {
-    /// Returns the ticket of the message that was sent by `here` to `peer`.
-    pub const fn ticket(&self, here: NodeAddress, peer: NodeAddress) -> Ticket {
-        Ticket {
+    /// Returns the run of messages that were sent by `here` to `peer`; `None` if the code of their outcome is unknown.
+    pub fn run(&self, here: NodeAddress, peer: NodeAddress) -> Option<OutcomeRun> {
+        let first = Ticket {
             source: Tid::new(here, self.source),
             destination: Tid::new(peer, self.destination),
             correlation: self.correlation,
-        }
+        };
+        self.outcome.map(|outcome| OutcomeRun::new(first, self.count, outcome))
     }
 }
 
-/// Parses the outcomes of a payload. Returns `None` if there are none, too many, or incomplete ones.
-pub fn read(payload: &[u8]) -> Option<impl Iterator<Item = ReportedOutcome>> {
-    let (outcomes, rest) = payload.as_chunks::<EACH>();
-    let is_right = rest.is_empty() && (1..=OUTCOMES_MAX).contains(&outcomes.len());
-    is_right.then(|| outcomes.iter().map(read_one))
+/// Returns the length of an entry in a frame of this kind.
+fn entry_len(kind: Kind) -> usize {
+    if kind == Kind::GNCL_OUTCOME_RUNS { RUN } else { EACH }
 }
 
-fn read_one(bytes: &[u8; EACH]) -> ReportedOutcome {
-    let [d0, d1, d2, d3, s0, s1, s2, s3, c0, c1, c2, c3, c4, c5, c6, c7, code] = *bytes;
-    ReportedOutcome {
+/// Parses the payload of a frame with outcomes, which has this kind. Returns `None` if an entry is incomplete or
+/// invalid, or if the entries are about no message or too many.
+pub fn read(kind: Kind, payload: &[u8]) -> Option<impl Iterator<Item = ReportedOutcome>> {
+    let entries = payload.chunks_exact(entry_len(kind));
+    if !entries.remainder().is_empty() || entries.len() > OUTCOMES_MAX {
+        return None;
+    }
+    let all =
+        entries.clone().try_fold(0_usize, |sum, entry| Some(sum + usize::from(read_one(entry)?.count)))?;
+    (1..=OUTCOMES_MAX).contains(&all).then(|| entries.filter_map(read_one))
+}
+
+/// Parses an entry. Returns `None` if it is about no message, or about one behind the last correlation.
+fn read_one(entry: &[u8]) -> Option<ReportedOutcome> {
+    let (outcome, count) = entry.split_first_chunk::<EACH>()?;
+    let [d0, d1, d2, d3, s0, s1, s2, s3, c0, c1, c2, c3, c4, c5, c6, c7, code] = *outcome;
+    let correlation = u64::from_le_bytes([c0, c1, c2, c3, c4, c5, c6, c7]);
+    let count = count.first().copied().unwrap_or(1);
+    correlation.checked_add(u64::from(count.checked_sub(1)?))?;
+    Some(ReportedOutcome {
         destination: AppAddress::new(u32::from_le_bytes([d0, d1, d2, d3])),
         source: AppAddress::new(u32::from_le_bytes([s0, s1, s2, s3])),
-        correlation: u64::from_le_bytes([c0, c1, c2, c3, c4, c5, c6, c7]),
+        correlation,
+        count,
         outcome: Outcome::from_code(code),
-    }
+    })
 }
 
 /// Returns the number of outcomes of a queued OUTCOME message: its own, and those that were [added](extend).
@@ -72,9 +97,10 @@ pub(super) fn count(queued: &Message) -> usize {
     1 + queued.header.sequence as usize
 }
 
-/// Returns the maximum number of outcomes in a frame with a payload of at most `payload_max` bytes.
-pub(super) fn frame_max(payload_max: usize) -> usize {
-    OUTCOMES_MAX.min(payload_max / EACH)
+/// Returns the maximum number of outcomes in a frame of this kind with a payload of at most `payload_max` bytes, if no
+/// two of them are of one run.
+pub(super) fn frame_max(kind: Kind, payload_max: usize) -> usize {
+    OUTCOMES_MAX.min(payload_max / entry_len(kind))
 }
 
 /// Adds the outcome of the message of `ticket` to a queued message, and returns whether it did. The queued message must
@@ -107,20 +133,34 @@ fn shorten(message: &mut Message, most: usize, queue: &mut SendQueue, counters: 
     counters.split();
 }
 
-/// Appends the outcomes of a queued OUTCOME message to `payload`.
-fn write(outcome: &Message, payload: &mut Vec<u8>) {
+/// Appends the outcomes of a queued OUTCOME message to the payload of a frame of this kind.
+fn write(outcome: &Message, kind: Kind, payload: &mut Vec<u8>) {
     let Header { source, destination, correlation, sequence, .. } = outcome.header;
-    for correlation in correlation..=correlation + sequence {
+    let mut entry = |correlation: u64, count: &[u8]| {
         payload.extend_from_slice(&source.app.bits().to_le_bytes());
         payload.extend_from_slice(&destination.app.bits().to_le_bytes());
         payload.extend_from_slice(&correlation.to_le_bytes());
         payload.extend_from_slice(&outcome.payload);
+        payload.extend_from_slice(count);
+    };
+    if kind == Kind::GNCL_OUTCOME_RUNS {
+        // A frame has at most 128 outcomes, so the number fits.
+        entry(correlation, &[count(outcome) as u8]);
+    } else {
+        (correlation..=correlation + sequence).for_each(|correlation| entry(correlation, &[]));
     }
 }
 
 /// Returns the number of submitted messages that this frame contains.
 pub(super) fn messages_in(frame: &Message) -> u64 {
-    if frame.header.kind == Kind::GNCL_OUTCOMES { (frame.payload.len() / EACH) as u64 } else { 1 }
+    match frame.header.kind {
+        Kind::GNCL_OUTCOMES => (frame.payload.len() / EACH) as u64,
+        Kind::GNCL_OUTCOME_RUNS => {
+            let (entries, _) = frame.payload.as_chunks::<RUN>();
+            entries.iter().map(|[.., count]| u64::from(*count)).sum()
+        }
+        _ => 1,
+    }
 }
 
 /// Whether this is an OUTCOME between the nodes of the link between the GNCLs in `link`.
@@ -140,13 +180,15 @@ pub(super) fn with_outcomes_behind(
     queue: &mut SendQueue,
     counters: &mut Counters,
 ) -> Message {
-    let max = frame_max(payload_max);
+    let max = link.map_or(0, |link| frame_max(link.kind, payload_max));
     let Some(link) = link.filter(|link| max > 1 && is_of(&first, link)) else {
         shorten(&mut first, 1, queue, counters);
         return first;
     };
     shorten(&mut first, max, queue, counters);
-    let (mut room, waiting) = (max - count(&first), count(&first) + queue.outcomes());
+    let entries =
+        if link.kind == Kind::GNCL_OUTCOME_RUNS { 1 + queue.len() } else { count(&first) + queue.outcomes() };
+    let mut room = max - count(&first);
     let mut next = |room: usize| {
         let fits = |next: &Message| is_of(next, &link) && count(next) <= room;
         if room > 0 { queue.pop_if(Class::Control, fits) } else { None }
@@ -155,11 +197,11 @@ pub(super) fn with_outcomes_behind(
     if second.is_none() && count(&first) == 1 {
         return first;
     }
-    let mut payload = Vec::with_capacity(EACH * max.min(waiting));
-    write(&first, &mut payload);
+    let mut payload = Vec::with_capacity(entry_len(link.kind) * max.min(entries));
+    write(&first, link.kind, &mut payload);
     while let Some(behind) = second {
         room -= count(&behind);
-        write(&behind, &mut payload);
+        write(&behind, link.kind, &mut payload);
         // From here on an audit counts them as one message, as the receiver does.
         counters.combine(1);
         second = next(room);
@@ -168,63 +210,4 @@ pub(super) fn with_outcomes_behind(
 }
 
 #[cfg(test)]
-mod tests {
-    use proptest::prelude::*;
-
-    use super::*;
-
-    fn app(number: u32) -> AppAddress {
-        AppAddress::new(number)
-    }
-
-    fn outcome(reported: &ReportedOutcome) -> Message {
-        let ticket = reported.ticket(NodeAddress::new(2), NodeAddress::new(1));
-        Message::outcome(ticket, reported.outcome.expect("it has a code"))
-    }
-
-    proptest! {
-        #[test]
-        fn any_bytes_give_a_bounded_number_of_outcomes(bytes in proptest::collection::vec(any::<u8>(), 0..3_000)) {
-            match read(&bytes) {
-                Some(outcomes) => prop_assert_eq!(outcomes.count() * EACH, bytes.len()),
-                None => prop_assert!(bytes.is_empty() || bytes.len() % EACH != 0 || bytes.len() > OUTCOMES_MAX * EACH),
-            }
-        }
-
-        #[test]
-        fn encoded_outcomes_are_decoded(
-            all in proptest::collection::vec((any::<u32>(), any::<u32>(), any::<u64>(), 0..=27_u8), 1..OUTCOMES_MAX)
-        ) {
-            let reported = all.into_iter().filter_map(|(destination, source, correlation, code)| {
-                let outcome = Some(Outcome::from_code(code)?);
-                Some(ReportedOutcome { destination: app(destination), source: app(source), correlation, outcome })
-            });
-            let reported: Vec<ReportedOutcome> = reported.collect();
-            prop_assume!(!reported.is_empty());
-            let mut payload = Vec::new();
-            reported.iter().for_each(|reported| write(&outcome(reported), &mut payload));
-            prop_assert_eq!(read(&payload).expect("whole outcomes").collect::<Vec<_>>(), reported);
-        }
-    }
-
-    #[test]
-    fn the_documentation_shows_the_bytes_of_two_outcomes() {
-        let page = include_str!("../../../../docs/protocol/gncl.md");
-        let shown = page.split_once("```outcomes").expect("the block begins").1;
-        let shown = shown.split_once("```").expect("the block ends").0;
-        let bytes = shown.lines().map(|line| line.split("  ").next().unwrap_or_default());
-        let bytes: Vec<u8> = bytes
-            .flat_map(str::split_whitespace)
-            .map(|byte| u8::from_str_radix(byte, 16).expect("two hexadecimal digits"))
-            .collect();
-        let reported: Vec<_> = read(&bytes).expect("whole outcomes").collect();
-        let first = ReportedOutcome {
-            destination: app(0x1001),
-            source: app(0x1002),
-            correlation: 7,
-            outcome: Some(Outcome::Delivered),
-        };
-        let full = Outcome::Rejected(sinew_runtime::outcome::Rejection::QueueFull);
-        assert_eq!(reported, [first, ReportedOutcome { correlation: 8, outcome: Some(full), ..first }]);
-    }
-}
+mod tests;

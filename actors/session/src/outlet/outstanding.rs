@@ -22,7 +22,7 @@ use sinew_runtime::{
     wire::Message,
 };
 
-use super::{OutletLimits, deferred::DeferredActions, numbering::Session};
+use super::{OutcomeRun, OutletLimits, deferred::DeferredActions, numbering::Session};
 
 /// Time after a sent message's time to live in which its outcome may still arrive.
 pub(super) const OUTCOME_GRACE: Duration = Duration::from_secs(1);
@@ -80,11 +80,15 @@ pub(super) struct Open {
     all: Mutex<Outstanding>,
     /// The number of these messages.
     count: AtomicUsize,
+    /// While there are fewer, no destination is at its bound.
+    always_open: usize,
 }
 
 impl Open {
     pub(super) fn new(shares: Shares) -> Self {
-        Self { all: Mutex::new(Outstanding::new(shares)), count: AtomicUsize::new(0) }
+        let all = Outstanding::new(shares);
+        let always_open = all.share_of_one().min(all.room_for_all());
+        Self { all: Mutex::new(all), count: AtomicUsize::new(0), always_open }
     }
 
     /// Calls the method of this name of [`Outstanding`], as do the following methods.
@@ -121,12 +125,15 @@ impl Open {
         self.with(Outstanding::take_all)
     }
 
+    /// Settles the message that `ticket` names. Returns whether it was pending.
     pub(super) fn confirm(&self, ticket: Ticket, outcome: Outcome, deferred: &mut DeferredActions) -> bool {
-        self.with(|all| all.confirm(ticket, outcome, deferred))
+        let mut run = OutcomeRun::new(ticket, 1, outcome);
+        self.with(|all| all.confirm(&mut run, deferred));
+        run.is_empty()
     }
 
-    /// Settles the outcomes that were pending, and leaves the others in `outcomes`.
-    pub(super) fn confirm_all(&self, outcomes: &mut Vec<(Ticket, Outcome)>, deferred: &mut DeferredActions) {
+    /// Settles the outcomes that were pending, and leaves the runs with others in `outcomes`.
+    pub(super) fn confirm_all(&self, outcomes: &mut Vec<OutcomeRun>, deferred: &mut DeferredActions) {
         if self.len() > 0 {
             self.with(|all| all.confirm_all(outcomes, deferred));
         }
@@ -148,8 +155,10 @@ impl Open {
         self.with(|all| all.wake_if_fewer_open(deferred));
     }
 
+    /// Whether this destination can have no further message. Only the thread with the outlet's lock adds messages, so
+    /// that others can only make the answer `false`. Most often it needs no lock.
     pub(super) fn is_at_bound(&self, destination: Tid) -> bool {
-        self.with(|all| all.is_at_bound(destination))
+        self.len() >= self.always_open && self.with(|all| all.is_at_bound(destination))
     }
 
     /// Registers a sender that found too many pending outcomes of this destination. It is woken when there
@@ -256,19 +265,6 @@ impl Outstanding {
         self.destinations.get(&destination).map_or((0, 0), |pending| (pending.sent.len(), pending.waiting))
     }
 
-    /// Removes the sent message that `ticket` names.
-    fn take(&mut self, ticket: Ticket) -> Option<Receipt> {
-        let count = self.destinations.len();
-        let pending = self.destinations.get_mut(&ticket.destination)?;
-        let at = pending.sent.iter().position(|sent| sent.receipt.ticket() == ticket)?;
-        let sent = pending.sent.remove(at)?;
-        self.sent -= 1;
-        if pending.is_empty() && count > EMPTY_DESTINATIONS_MAX {
-            self.destinations.remove(&ticket.destination);
-        }
-        Some(sent.receipt)
-    }
-
     /// Removes sent messages that expired more than `grace` before `now`, the oldest first per destination.
     /// Visits each message once, however many are removed, because a sender may wait for the lock.
     fn take_overdue(&mut self, now: Time, grace: Duration) -> Vec<Receipt> {
@@ -301,66 +297,47 @@ impl Outstanding {
         all.into_iter()
     }
 
-    /// Settles the messages with a reported outcome, and keeps all other outcomes. Those of a flood come in the
-    /// order of its messages: one look-up of the destination serves all that follow each other.
-    fn confirm_all(&mut self, outcomes: &mut Vec<(Ticket, Outcome)>, deferred: &mut DeferredActions) {
-        let (mut at, mut left) = (0, 0);
-        while let Some((ticket, outcome)) = outcomes.get(at).copied() {
-            let in_order = self.confirm_oldest(ticket.destination, &outcomes[at..], deferred);
-            at += in_order;
-            if in_order == 0 {
-                at += 1;
-                if !self.confirm(ticket, outcome, deferred) {
-                    outcomes[left] = (ticket, outcome);
-                    left += 1;
-                }
-            }
-        }
-        outcomes.truncate(left);
+    /// Settles the messages with a reported outcome, and keeps the runs with others.
+    fn confirm_all(&mut self, outcomes: &mut Vec<OutcomeRun>, deferred: &mut DeferredActions) {
+        outcomes.retain_mut(|run| {
+            self.confirm(run, deferred);
+            !run.is_empty()
+        });
     }
 
-    /// Settles the oldest sent messages of a destination for as long as the first outcomes are theirs, each the next.
-    /// Returns their number.
-    fn confirm_oldest(
-        &mut self,
-        destination: Tid,
-        outcomes: &[(Ticket, Outcome)],
-        deferred: &mut DeferredActions,
-    ) -> usize {
-        let Some(pending) = self.destinations.get_mut(&destination) else { return 0 };
-        let mut settled = 0;
-        for (ticket, outcome) in outcomes {
-            let Some(sent) = pending.sent.pop_front_if(|sent| sent.receipt.ticket() == *ticket) else {
-                break;
-            };
-            deferred.settle([(sent.receipt, *outcome)]);
-            settled += 1;
+    /// Settles the messages of a run that are pending.
+    fn confirm(&mut self, run: &mut OutcomeRun, deferred: &mut DeferredActions) {
+        self.settle_sent(run, deferred);
+        // The outcome arrived before the write returned: the writing thread settles it.
+        if let Some((writing, reported)) = &mut self.writing
+            && reported.is_none()
+            && run.settle(*writing)
+        {
+            *reported = Some(run.outcome());
+        }
+    }
+
+    /// Settles the sent messages of a run, in the order in which they were sent. Visits each message of the destination
+    /// at most once. The outcomes of a flood come in this order, so that its first message is the oldest one.
+    fn settle_sent(&mut self, run: &mut OutcomeRun, deferred: &mut DeferredActions) {
+        let (count, destination) = (self.destinations.len(), run.destination());
+        let Some(pending) = self.destinations.get_mut(&destination) else { return };
+        let (before, mut at) = (pending.sent.len(), 0);
+        while !run.is_empty() {
+            let mut next = pending.sent.range(at..);
+            let Some(skipped) = next.position(|sent| run.settle(sent.receipt.ticket())) else { break };
+            at += skipped;
+            deferred.settle(pending.sent.remove(at).map(|sent| (sent.receipt, run.outcome())));
+        }
+        let settled = before - pending.sent.len();
+        if settled == 0 {
+            return;
         }
         self.sent -= settled;
-        if pending.is_empty() && settled > 0 && self.destinations.len() > EMPTY_DESTINATIONS_MAX {
+        if pending.is_empty() && count > EMPTY_DESTINATIONS_MAX {
             self.destinations.remove(&destination);
         }
-        if settled > 0 {
-            self.wake_if_fewer_open(deferred);
-        }
-        settled
-    }
-
-    /// Settles the message that `ticket` names. Returns whether it was pending.
-    fn confirm(&mut self, ticket: Ticket, outcome: Outcome, deferred: &mut DeferredActions) -> bool {
-        if let Some(receipt) = self.take(ticket) {
-            deferred.settle([(receipt, outcome)]);
-            self.wake_if_fewer_open(deferred);
-            return true;
-        }
-        match &mut self.writing {
-            // The outcome arrived before the write returned: the writing thread settles it.
-            Some((writing, reported @ None)) if *writing == ticket => {
-                *reported = Some(outcome);
-                true
-            }
-            Some(_) | None => false,
-        }
+        self.wake_if_fewer_open(deferred);
     }
 
     /// Wakes the waiting sender once its destination has room for half of its share. Other destinations may
@@ -382,7 +359,7 @@ impl Outstanding {
     /// Returns how many more outcomes may be pending in total. Without a session, each destination's bound is
     /// also the bound of all.
     fn room_for_all(&self) -> usize {
-        let bound = UNCONFIRMED_DESTINATIONS * self.shares.unconfirmed_max;
+        let bound = UNCONFIRMED_DESTINATIONS.saturating_mul(self.shares.unconfirmed_max);
         let bound = self.shares.outcome_room.map_or(usize::MAX, |there| bound.min(there));
         bound.saturating_sub(self.open())
     }

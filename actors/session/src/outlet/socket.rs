@@ -69,6 +69,13 @@ pub trait Socket: Send + 'static {
         false
     }
 
+    /// Counts a message that was added to a queued one. Enough of them postpone the delayed wake of
+    /// [`wake_later`](Self::wake_later), up to a maximum.
+    fn joins_delayed(&mut self) {}
+
+    /// Records that a sender has written the queued messages, so that later ones may postpone the delayed wake again.
+    fn wrote_delayed(&mut self) {}
+
     /// Registers the awake drain task for the delayed wake of [`wake_later`](Self::wake_later).
     fn poll_delayed_wake(&mut self, cx: &mut Context<'_>) {
         let _ = cx;

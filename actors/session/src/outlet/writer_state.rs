@@ -190,10 +190,12 @@ impl<S: Socket> WriterState<S> {
         outcome: Outcome,
         deferred: &mut DeferredActions,
     ) -> bool {
-        let is_added = self.numbering.combines_outcomes()
-            && !self.link_frames.is_finishing()
-            && self.unsent.queue.extend_outcome(ticket, outcome, outcomes::frame_max(self.payload_max));
+        let Some(link) = self.numbering.outcomes_header() else { return false };
+        let max = outcomes::frame_max(link.kind, self.payload_max);
+        let is_added =
+            !self.link_frames.is_finishing() && self.unsent.queue.extend_outcome(ticket, outcome, max);
         if is_added {
+            self.connection.joins_delayed();
             self.help(deferred);
         }
         is_added
@@ -349,9 +351,13 @@ impl<S: Socket> WriterState<S> {
         if !self.connection.is_present(link) {
             return false;
         }
+        let had_frame = self.has_frame();
         let Some(effect) = self.numbering.on_ack(ack) else { return false };
         self.unsent.on_held(ack);
-        self.connection.wake_drainer(deferred);
+        // A frame that could be written before has its wake. In a flood another one for each ACK would end its delay.
+        if !had_frame && self.has_frame() || !matches!(effect, AckEffect::Known) {
+            self.connection.wake_drainer(deferred);
+        }
         match effect {
             AckEffect::Known => false,
             AckEffect::Resumed => {

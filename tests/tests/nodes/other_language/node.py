@@ -12,6 +12,7 @@ import secrets, select, socket, struct, sys, time, zlib
 
 QUERY, ANSWER, LEAVE = 0x20, 0x21, 0x22
 HELLO, WELCOME, REFUSAL, PING, PONG, GOODBYE, ACK, VOID, OUTCOMES, DATAGRAMS = range(0x10, 0x1a)
+OUTCOME_RUNS = 0x1b
 OUTCOME, DIRECTORY = 0x01, 0x30
 CONFIRM, ASK, REPLY, IS_OUTCOME = 1, 2, 4, 8
 SYNC, GNCL, NDL, EVERY = 2, 3, 4, 0xffffffff
@@ -311,7 +312,7 @@ def introduced(link, hello):
     them, _ = unpack(hello.payload)
     assert hello.kind == HELLO and them["project"] == project and them["peer"] == here
     peer, lane = them["node"], them.get("lane", "control")
-    features = ["guard", "outcomes"] + (["classes", "datagrams-2"] if by_class else [])
+    features = ["guard", "outcomes"] + (["classes", "datagrams-2", "outcome-runs"] if by_class else [])
     ours = {"project": project, "node": here, "name": "python", "incarnation": incarnation, "peer": peer, "dial": 0,
             "payload_max": 65536, "features": features, "lane": lane, "link": them.get("link", 0)}
     link.own(WELCOME, ours)
@@ -348,6 +349,11 @@ def take(session, message):
         for _, _, correlation, outcome in struct.iter_unpack("<IIQB", message.payload):
             told += 1
             say("outcome", correlation, outcome)
+    elif message.kind == OUTCOME_RUNS:
+        for _, _, first, outcome, count in struct.iter_unpack("<IIQBB", message.payload):
+            for correlation in range(first, first + count):
+                told += 1
+                say("outcome", correlation, outcome)
     elif by_class and message.cls == 1 and message.kind == kind_of(value_kind):
         if stream_by_datagram.is_new(message):
             say("value", unpack(message.payload)[0]["number"], "by the connection")

@@ -87,7 +87,8 @@ impl ByHand {
     pub(in crate::tests) async fn send(&mut self, message: &Message) {
         let mut bytes = bytes::BytesMut::new();
         let mut message = Message::new(message.header, message.payload.clone());
-        if message.header.destination.app != AppAddress::GNCL || message.header.kind == Kind::GNCL_OUTCOMES {
+        let is_of_outcomes = matches!(message.header.kind, Kind::GNCL_OUTCOMES | Kind::GNCL_OUTCOME_RUNS);
+        if message.header.destination.app != AppAddress::GNCL || is_of_outcomes {
             message.header.number = self.number;
             self.number = self.number.wrapping_add(1);
         }

@@ -62,20 +62,30 @@ proptest! {
             .zip(&reported)
             .map(|(number, (.., to))| {
                 let to = if *to < 2 { *to } else { sent.get(number).map_or(0, |(to, _)| *to) };
-                let ticket = Ticket { source: tid(0), destination: tid(to), correlation: number as u64 };
-                (ticket, Outcome::Delivered)
+                Ticket { source: tid(0), destination: tid(to), correlation: number as u64 }
             })
             .collect();
         let (one_by_one, together) = (Arc::<NullSink>::default(), Arc::<NullSink>::default());
         let mut expected = outstanding_at(&one_by_one, &sent);
         let mut deferred = DeferredActions::default();
         let mut expected_left = outcomes.clone();
-        expected_left.retain(|(ticket, outcome)| !expected.confirm(*ticket, *outcome, &mut deferred));
+        expected_left.retain(|ticket| {
+            let mut run = OutcomeRun::new(*ticket, 1, Outcome::Delivered);
+            expected.confirm(&mut run, &mut deferred);
+            !run.is_empty()
+        });
         deferred.run();
         let (mut outstanding, mut deferred) = (outstanding_at(&together, &sent), DeferredActions::default());
-        let mut left = outcomes;
-        outstanding.confirm_all(&mut left, &mut deferred);
+        let mut runs = Vec::<OutcomeRun>::new();
+        for ticket in outcomes {
+            let run = OutcomeRun::new(ticket, 1, Outcome::Delivered);
+            if !runs.last_mut().is_some_and(|last| last.extend(&run)) {
+                runs.push(run);
+            }
+        }
+        outstanding.confirm_all(&mut runs, &mut deferred);
         deferred.run();
+        let left: Vec<Ticket> = runs.iter().flat_map(OutcomeRun::tickets).collect();
         prop_assert_eq!(left, expected_left);
         prop_assert_eq!(&*together.0.lock().unwrap(), &*one_by_one.0.lock().unwrap());
         prop_assert_eq!(outstanding.open(), expected.open());
@@ -102,6 +112,64 @@ proptest! {
         let left: Vec<Receipt> = outstanding.take_all().map(|sent| sent.receipt).collect();
         prop_assert_eq!(correlations(&left), those(false));
     }
+}
+
+#[test]
+fn run_settles_each_correlation_once_and_in_any_order() {
+    // Two messages have correlation 1, and 3 was sent before 2.
+    let sink = Arc::<NullSink>::default();
+    let mut outstanding = outstanding(&[]);
+    let ticket = |correlation| Ticket { source: tid(0), destination: tid(1), correlation };
+    for correlation in [0, 1, 1, 3, 2, 9] {
+        outstanding.add_waiting(Some(tid(1)));
+        let receipt = Receipt::new(sink.clone(), ticket(correlation));
+        assert!(outstanding.sent(SentMessage { receipt, expiry: Time::MAX, written: 0 }).is_none());
+    }
+    let mut runs = vec![OutcomeRun::new(ticket(1), 4, Outcome::Delivered)];
+    let mut deferred = DeferredActions::default();
+    outstanding.confirm_all(&mut runs, &mut deferred);
+    deferred.run();
+    let settled: Vec<_> = sink.0.lock().unwrap().iter().map(|ticket| ticket.correlation).collect();
+    assert_eq!(settled, [1, 3, 2]);
+    assert_eq!(runs.iter().flat_map(OutcomeRun::tickets).collect::<Vec<_>>(), [ticket(4)], "it was not sent");
+    assert_eq!(outstanding.open(), 3);
+    let left: Vec<Receipt> = outstanding.take_all().map(|sent| sent.receipt).collect();
+    assert_eq!(correlations(&left), [0, 1, 9]);
+}
+
+#[test]
+fn bound_without_the_lock_is_the_bound_under_it() {
+    for (unconfirmed_max, outcome_room) in [
+        (0, None),
+        (1, None),
+        (5, None),
+        (5, Some(0)),
+        (5, Some(1)),
+        (5, Some(16)),
+        (5, Some(1_000)),
+        (1, Some(80)),
+    ] {
+        let open = Open::new(Shares { unconfirmed_max, outcome_room });
+        for count in 0..100 {
+            for to in [1, 2, 3] {
+                let expected = lock(&open).is_at_bound(tid(to));
+                assert_eq!(
+                    open.is_at_bound(tid(to)),
+                    expected,
+                    "{count} of {unconfirmed_max}, {outcome_room:?}"
+                );
+            }
+            open.add_waiting(Some(tid(1 + count % 2)));
+            let ticket =
+                Ticket { source: tid(0), destination: tid(1 + count % 2), correlation: count.into() };
+            let receipt = Receipt::new(Arc::<NullSink>::default(), ticket);
+            assert!(open.sent(SentMessage { receipt, expiry: Time::MAX, written: 0 }).is_none());
+        }
+    }
+}
+
+fn lock(open: &Open) -> std::sync::MutexGuard<'_, Outstanding> {
+    open.all.lock().unwrap()
 }
 
 #[test]

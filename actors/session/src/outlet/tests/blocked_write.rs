@@ -63,7 +63,7 @@ fn outcomes_are_settled_during_a_blocked_write() {
         writes.recv_timeout(WATCHDOG).expect("the second one is being written");
         let (report, reported) = sync_channel(1);
         scope.spawn(move || {
-            let mut outcomes = vec![(known, Outcome::Delivered)];
+            let mut outcomes = vec![OutcomeRun::new(known, 1, Outcome::Delivered)];
             outlet.confirm_all(&mut outcomes);
             let _ = report.send((outcomes.len(), outlet.expire(Time::now()), outlet.unconfirmed()));
         });

@@ -3,6 +3,7 @@
 use std::thread;
 
 use super::*;
+use crate::Window;
 
 /// Counts the writes to a wire.
 struct Counting {
@@ -200,4 +201,39 @@ fn gathered_urgent_message_counts_until_its_last_byte() {
     burst.wire.room.store(PLENTY, Ordering::Relaxed);
     burst.drain();
     assert_eq!(burst.outlet.urgent_left(), 0);
+}
+
+#[test]
+fn acknowledgement_wakes_the_drainer_only_for_a_message() {
+    // Given: a window of one message, which is written, and a drain task that waits.
+    let window = Window { messages: 1, bytes: PLENTY };
+    let void = message(Class::Control, 0).header;
+    let outlet = SocketWriter::with_session(LIMITS, Session::new(1, window, void, None));
+    let wire = Arc::new(Wire::default());
+    wire.room.store(PLENTY, Ordering::Relaxed);
+    let link = outlet.connect(wire.clone(), usize::MAX, None);
+    let bench = Bench { outlet, wire, link, outcome_log: Arc::default() };
+    let receive_ack = |next| {
+        let ack = Ack { receiver_id: 1, epoch: 1, peer_epoch: 1, next, change: 0, held: vec![], room: None };
+        bench.outlet.on_ack(link, &ack, Time::now());
+    };
+    let is_asleep = || bench.outlet.lock().connection.is_drainer_asleep();
+    bench.drain();
+    receive_ack(1);
+    assert!(!is_asleep(), "the first one begins the connection");
+    bench.drain();
+    bench.submit(message(Class::Control, 1));
+    // When: nothing waits, then a message waits for the window.
+    receive_ack(2);
+    assert!(is_asleep(), "there is nothing to write");
+    bench.submit(message(Class::Control, 2));
+    bench.submit(message(Class::Control, 3));
+    assert!(is_asleep(), "there is no room to write");
+    receive_ack(2);
+    assert!(is_asleep(), "there still is none");
+    receive_ack(3);
+    // Then
+    assert!(!is_asleep());
+    bench.drain();
+    assert_eq!(bench.seen(), [1, 2, 3]);
 }

@@ -3,7 +3,10 @@
 use proptest::prelude::*;
 
 use super::*;
-use crate::{Window, outlet::outcomes::read};
+use crate::{
+    Window,
+    outlet::outcomes::{ReportedOutcome, read},
+};
 
 const FAR: NodeAddress = NodeAddress::new(2);
 
@@ -17,11 +20,14 @@ fn outcome(correlation: u64) -> Message {
     Message::outcome(ticket(correlation), Outcome::Delivered)
 }
 
-/// An outlet with a peer that supports several in one frame, or does not; its wire accepts nothing yet.
-fn bench(takes_outcomes: bool, payload_max: usize) -> Bench {
+/// Both kinds of frames with several outcomes.
+const FRAMES: [Kind; 2] = [Kind::GNCL_OUTCOMES, Kind::GNCL_OUTCOME_RUNS];
+
+/// An outlet with a peer that supports several in one frame of this kind, or not; its wire accepts nothing yet.
+fn bench(frame: Option<Kind>, payload_max: usize) -> Bench {
     let gncl = |node| Tid::new(node, AppAddress::GNCL);
     let header = |kind| Header::new(kind, gncl(NodeAddress::new(1)), gncl(FAR));
-    let outcomes = takes_outcomes.then(|| header(Kind::GNCL_OUTCOMES));
+    let outcomes = frame.map(header);
     let window = Window { messages: 64, bytes: PLENTY };
     let session = Session::new(1, window, header(Kind::GNCL_VOID), outcomes);
     let outlet = SocketWriter::with_session(OutletLimits { payload_max: 10_000, ..LIMITS }, session);
@@ -37,12 +43,22 @@ fn receive_ack(bench: &Bench, next: u64) {
     bench.outlet.on_ack(bench.link, &ack, Time::now());
 }
 
+/// Returns the application, the correlation and the byte of each outcome in a frame with several.
+fn each(frame: &Message) -> Vec<(u32, u64, u8)> {
+    let all = read(frame.header.kind, &frame.payload).expect("whole outcomes");
+    let of_run = |run: ReportedOutcome| {
+        let code = run.outcome.expect("a known outcome").code();
+        (0..u64::from(run.count)).map(move |at| (run.destination.bits(), run.correlation + at, code))
+    };
+    all.flat_map(of_run).collect()
+}
+
 /// Returns the frames on the wire: for each its number, its kind, and the correlations of its outcomes.
 fn seen(bench: &Bench) -> Vec<(u16, Kind, Vec<u64>)> {
     let frames = frames(&bench.wire.bytes.lock().unwrap());
     let correlations = |frame: &Message| match frame.header.kind {
-        Kind::GNCL_OUTCOMES => {
-            read(&frame.payload).expect("whole outcomes").map(|reported| reported.correlation).collect()
+        kind if FRAMES.contains(&kind) => {
+            each(frame).into_iter().map(|(_, correlation, _)| correlation).collect()
         }
         _ => vec![frame.header.correlation],
     };
@@ -51,7 +67,7 @@ fn seen(bench: &Bench) -> Vec<(u16, Kind, Vec<u64>)> {
 
 #[test]
 fn only_waiting_outcomes_are_combined() {
-    let bench = bench(true, usize::MAX);
+    let bench = bench(Some(Kind::GNCL_OUTCOMES), usize::MAX);
     bench.wire.room.store(65, Ordering::Relaxed);
     for correlation in 1..=4 {
         bench.outlet.submit_beyond(outcome(correlation)).unwrap();
@@ -78,7 +94,7 @@ fn only_waiting_outcomes_are_combined() {
 
 #[test]
 fn unsupporting_peer_gets_single_outcomes() {
-    let bench = bench(false, usize::MAX);
+    let bench = bench(None, usize::MAX);
     for correlation in 1..=3 {
         bench.outlet.submit_beyond(outcome(correlation)).unwrap();
     }
@@ -89,7 +105,7 @@ fn unsupporting_peer_gets_single_outcomes() {
 #[test]
 fn frame_is_limited_to_128_outcomes_and_peer_maximum() {
     for (payload_max, at_once) in [(usize::MAX, 128), (17 * 100 + 16, 100), (33, 1)] {
-        let bench = bench(true, payload_max);
+        let bench = bench(Some(Kind::GNCL_OUTCOMES), payload_max);
         for correlation in 1..=300 {
             bench.outlet.submit_beyond(outcome(correlation)).unwrap();
         }
@@ -107,7 +123,7 @@ fn frame_is_limited_to_128_outcomes_and_peer_maximum() {
 
 #[test]
 fn outcome_for_third_node_is_sent_alone() {
-    let bench = bench(true, usize::MAX);
+    let bench = bench(Some(Kind::GNCL_OUTCOMES), usize::MAX);
     let mut astray = outcome(2);
     astray.header.source.node = NodeAddress::new(7);
     for message in [outcome(1), astray, outcome(3)] {
@@ -119,7 +135,7 @@ fn outcome_for_third_node_is_sent_alone() {
 
 #[test]
 fn combined_outcomes_are_resent_unchanged() {
-    let mut bench = bench(true, usize::MAX);
+    let mut bench = bench(Some(Kind::GNCL_OUTCOMES), usize::MAX);
     for correlation in 1..=3 {
         bench.outlet.submit_beyond(outcome(correlation)).unwrap();
     }
@@ -138,7 +154,7 @@ fn report(bench: &Bench, ticket: Ticket, outcome: Outcome) {
 
 #[test]
 fn outcomes_of_consecutive_messages_wait_as_one() {
-    let bench = bench(true, usize::MAX);
+    let bench = bench(Some(Kind::GNCL_OUTCOMES), usize::MAX);
     (1..=300).for_each(|correlation| report(&bench, ticket(correlation), Outcome::Delivered));
     assert_eq!(bench.outlet.waiting(), 3);
     bench.make_room(PLENTY);
@@ -150,8 +166,23 @@ fn outcomes_of_consecutive_messages_wait_as_one() {
 }
 
 #[test]
+fn run_is_one_entry_for_a_peer_that_accepts_runs() {
+    for (frame, bytes) in FRAMES.into_iter().zip([100 * 17, 2 * 18]) {
+        let bench = bench(Some(frame), usize::MAX);
+        for correlation in (1..=40).chain(42..=101) {
+            report(&bench, ticket(correlation), Outcome::Delivered);
+        }
+        assert_eq!(bench.outlet.waiting(), 2);
+        bench.make_room(PLENTY);
+        assert_eq!(seen(&bench), [(1, frame, (1..=40).chain(42..=101).collect::<Vec<_>>())]);
+        assert_eq!(frames(&bench.wire.bytes.lock().unwrap())[0].payload.len(), bytes);
+        assert_eq!(bench.outlet.counts().sent, 100, "each outcome counts");
+    }
+}
+
+#[test]
 fn unsupporting_peer_gets_each_reported_outcome_alone() {
-    let bench = bench(false, usize::MAX);
+    let bench = bench(None, usize::MAX);
     (1..=3).for_each(|correlation| report(&bench, ticket(correlation), Outcome::Delivered));
     assert_eq!(bench.outlet.waiting(), 3);
     bench.make_room(PLENTY);
@@ -161,7 +192,7 @@ fn unsupporting_peer_gets_each_reported_outcome_alone() {
 #[test]
 fn waiting_outcomes_are_divided_for_a_shorter_frame() {
     for (payload_max, at_once) in [(17 * 3, 3), (17, 1)] {
-        let mut bench = bench(true, usize::MAX);
+        let mut bench = bench(Some(Kind::GNCL_OUTCOMES), usize::MAX);
         (1..=10).for_each(|correlation| report(&bench, ticket(correlation), Outcome::Delivered));
         bench.outlet.disconnect(bench.link);
         bench.wire = Arc::default();
@@ -180,7 +211,7 @@ fn waiting_outcomes_are_divided_for_a_shorter_frame() {
 
 #[test]
 fn ending_outlet_takes_no_further_outcome() {
-    let bench = bench(true, usize::MAX);
+    let bench = bench(Some(Kind::GNCL_OUTCOMES), usize::MAX);
     report(&bench, ticket(1), Outcome::Delivered);
     bench.outlet.finish(message(Class::Control, 9));
     let refused = bench.outlet.report_outcome(ticket(2), Outcome::Delivered, usize::MAX).unwrap_err();
@@ -215,13 +246,7 @@ fn arrived(bench: &Bench) -> Vec<(u32, u64, u8)> {
     for frame in &frames {
         let header = &frame.header;
         match header.kind {
-            Kind::GNCL_OUTCOMES => {
-                let all = read(&frame.payload).expect("whole outcomes");
-                arrived.extend(all.map(|one| {
-                    let code = one.outcome.expect("a known outcome").code();
-                    (one.destination.bits(), one.correlation, code)
-                }));
-            }
+            kind if FRAMES.contains(&kind) => arrived.extend(each(frame)),
             Kind::OUTCOME => {
                 assert_eq!((header.sequence, frame.payload.len()), (0, 1), "the form on a connection");
                 arrived.push((header.source.app.bits(), header.correlation, frame.payload[0]));
@@ -238,8 +263,9 @@ proptest! {
     fn each_outcome_arrives_once_in_its_place(
         steps in steps(),
         payload_max in prop_oneof![Just(usize::MAX), Just(17 * 5 + 1), Just(17 * 2), Just(17)],
+        frame in proptest::sample::select(FRAMES.to_vec()),
     ) {
-        let (bench, mut expected, mut correlations) = (bench(true, payload_max), Vec::new(), [0; 2]);
+        let (bench, mut expected, mut correlations) = (bench(Some(frame), payload_max), Vec::new(), [0; 2]);
         for step in steps {
             match step {
                 Step::Report { app, skips, outcome } => {
