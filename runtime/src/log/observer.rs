@@ -6,8 +6,8 @@ use tracing::Level;
 
 use crate::lock;
 
-/// Maximum number of observers in a process: each node of it that records is one.
-const OBSERVERS_MAX: usize = 64;
+/// Maximum number of observers in a process: each node of it has one, and one more while it records.
+const OBSERVERS_MAX: usize = 128;
 
 /// An observer of log events. It is called on the log thread, and delays later lines as long as it runs.
 pub trait LogObserver: Send + Sync {
