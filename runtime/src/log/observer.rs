@@ -29,7 +29,7 @@ pub fn observe(observer: &Arc<dyn LogObserver>) -> bool {
 }
 
 /// Shows an event to all observers. Its text is made only if there is one.
-pub(super) fn show(level: Level, target: &str, text: impl FnOnce() -> String) {
+pub(crate) fn show(level: Level, target: &str, text: impl FnOnce() -> String) {
     // The lock is released before any of them is called.
     let observers: Vec<_> = lock(&OBSERVERS).iter().filter_map(Weak::upgrade).collect();
     if observers.is_empty() {
