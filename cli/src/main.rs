@@ -15,6 +15,7 @@ mod audit;
 mod bag;
 mod doctor;
 mod keys;
+mod logs;
 mod messagepack;
 mod nodes;
 mod output;
@@ -129,6 +130,7 @@ fn run(arguments: &Arguments) -> Result<Report, SystemError> {
         Command::Watch(order) => {
             inside(&|system| watch::show(system, order, (arguments.json, arguments.wide)))
         }
+        Command::Logs(order) => inside(&|system| logs::show(system, order, arguments.json)),
         Command::Play(order) => play::show(order, arguments),
         Command::Record(order) => inside(&|system| record::show(system, order)),
         Command::View(order) => view::show(order, arguments),

@@ -5,6 +5,7 @@ mod bag;
 mod doctor;
 mod fault;
 mod keys;
+mod logs;
 mod mistakes;
 mod output;
 mod page;
