@@ -105,6 +105,14 @@ pub(crate) enum Command {
   sinew logs --node knee --level warn
   sinew logs -f --json | jq -r 'select(.level == "error") | .text'"#)]
     Logs(logs::Order),
+    /// Shows nodes, applications, links and losses on the terminal, twice a second: rates, queues, lateness, guards
+    ///
+    /// Keys: q ends it, the arrows and the page keys scroll, / filters the rows by a text, p pauses. Where standard
+    /// output is no terminal, or with --json, it prints one table of the rates within a second, and ends.
+    #[command(after_help = r#"Examples:
+  sinew top
+  sinew top --json | jq '.losses'"#)]
+    Top,
     /// Records the messages of the node's applications into an MCAP file, until Ctrl-C
     ///
     /// The node writes its messages into memory, and this command writes them to the file: no sender waits for it.
@@ -303,6 +311,7 @@ Examples:
   sinew send knee.drive demo.angle '{\"degrees\": 5}'
   sinew watch knee.drive --received
   sinew logs -f --since 10s
+  sinew top
   sinew record walk.mcap --for 30s
   sinew play walk.mcap --rate 0.5
   sinew why hip knee.drive
