@@ -36,8 +36,8 @@ pub(crate) fn show(arguments: &Arguments) -> Result<Report, SystemError> {
     std::thread::sleep(RATES_PERIOD);
     let now = nodes.snapshot();
     let model = Model::of(Some(&first), &now);
-    if let Some(why) = model.fault {
-        return Err(SystemError::NoAnswer(nodes.path(), why));
+    if let Some(why) = &model.fault {
+        return Err(SystemError::NoAnswer(nodes.path(), why.clone()));
     }
     Ok(Report { text: text(&model), json: model.json(), is_fine: model.is_fine() })
 }
