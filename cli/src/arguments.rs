@@ -97,8 +97,8 @@ pub(crate) enum Command {
     /// Shows the log lines of all nodes in the order of time: time, level, node, part of the program, text
     ///
     /// Each node keeps its newest lines in memory, at most 2,048. Missing ones are counted, and a node that cannot be
-    /// asked is named. Times are those of this host: the clocks of other nodes are measured. With --json each line is an
-    /// object.
+    /// asked is named. Times are those of this host: the clocks of other nodes are measured. With --json each line is
+    /// an object.
     #[command(after_help = r#"Examples:
   sinew logs
   sinew logs -f --since 10s

@@ -1,7 +1,7 @@
 //! `sinew top`: nodes, applications, links and losses on a terminal.
 //!
-//! It asks for the snapshots of `sinew view`, twice a second, and shows their differences as rates. Where standard output
-//! is no terminal it prints one table.
+//! It takes the snapshots of `sinew view`, twice a second, and shows their differences as rates. Where standard
+//! output is no terminal it prints one table.
 
 mod controls;
 mod lines;
