@@ -96,6 +96,11 @@ impl LogRing {
     pub(crate) fn read(&self, wanted: Wanted) -> Found {
         lock(&self.0).read(wanted)
     }
+
+    /// Returns the newest lines, oldest first. `from` does not count.
+    pub(crate) fn newest(&self, wanted: Wanted) -> Found {
+        lock(&self.0).newest(wanted)
+    }
 }
 
 impl LogObserver for LogRing {
@@ -158,6 +163,19 @@ impl Kept {
             }
         }
         found
+    }
+
+    fn newest(&self, wanted: Wanted) -> Found {
+        let Wanted { level, lines_max, bytes_max, .. } = wanted;
+        let mut bytes = 0;
+        let has_room = |line: &&Arc<Line>| {
+            bytes += line.bytes();
+            bytes <= bytes_max
+        };
+        let shown = self.lines.iter().rev().filter(|line| line.level <= level).take(lines_max);
+        let mut lines: Vec<_> = shown.take_while(has_room).cloned().collect();
+        lines.reverse();
+        Found { lines, next: self.next, ..Found::default() }
     }
 }
 
@@ -238,6 +256,18 @@ mod tests {
         kept.push(line(Level::DEBUG, "detail"), 0);
         let found = kept.read(Wanted { level: Level::WARN, ..all(0) });
         assert_eq!((numbers(&found), found.next, found.more), (vec![3], 5, false));
+    }
+
+    #[test]
+    fn newest_lines_are_bounded_and_in_order() {
+        let mut kept = kept(10);
+        kept.push(line(Level::DEBUG, "detail"), 0);
+        let newest = Wanted { from: 2, level: Level::INFO, lines_max: 3, bytes_max: usize::MAX };
+        let found = kept.newest(newest);
+        assert_eq!((numbers(&found), found.next, found.more), (vec![8, 9, 10], 12, false));
+        let two_lines = 2 * kept.lines[8].bytes();
+        assert_eq!(numbers(&kept.newest(Wanted { bytes_max: two_lines, ..newest })), [9, 10]);
+        assert!(kept.newest(Wanted { lines_max: 0, ..newest }).lines.is_empty());
     }
 
     #[test]

@@ -45,7 +45,7 @@ impl Source {
     }
 
     pub(super) fn question(&self, level: &str) -> AskLogs {
-        AskLogs { from: self.next, level: Some(level.to_owned()) }
+        AskLogs { from: self.next, level: Some(level.to_owned()), newest: None }
     }
 
     /// Returns the entries of an answer that came at `now`. A node that was started anew is read from its first line:
@@ -145,7 +145,8 @@ mod tests {
     fn restarted_node_is_read_from_its_first_line() {
         let mut source = Source { offset_ns: Some(0), ..Source::new(KNEE, String::new()) };
         source.take(report(1, &[(1, 100), (2, 200)]), NOW);
-        assert_eq!(source.question("warn"), AskLogs { from: 3, level: Some("warn".to_owned()) });
+        let question = AskLogs { from: 3, level: Some("warn".to_owned()), newest: None };
+        assert_eq!(source.question("warn"), question);
         assert!(source.take(report(2, &[(3, 400)]), NOW).is_empty());
         assert_eq!((source.question("warn").from, source.more), (0, true));
         assert_eq!(times(&source.take(report(2, &[(1, 300)]), NOW)), [(1, 300)]);

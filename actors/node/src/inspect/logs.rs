@@ -15,11 +15,13 @@ const BYTES_MAX: usize = 32 * 1024;
 
 /// Returns the lines from the number of the question on.
 pub(super) fn kept(state: &Arc<NodeState>, question: &Message) -> Result<LogsReport, Rejection> {
-    let AskLogs { from, level } = question.decode().map_err(|_| Rejection::Malformed)?;
+    let AskLogs { from, level, newest } = question.decode().map_err(|_| Rejection::Malformed)?;
     let level = level.as_deref().map_or(Ok(Level::TRACE), str::parse).map_err(|_| Rejection::Malformed)?;
     let bytes_max = BYTES_MAX.min(state.ctx.config.payload_max / 2);
-    let Found { lines, next, more, lost } =
-        state.log.read(Wanted { from, level, lines_max: LOG_LINES_MAX, bytes_max });
+    let lines_max = newest.map_or(LOG_LINES_MAX, |newest| LOG_LINES_MAX.min(newest as usize));
+    let wanted = Wanted { from, level, lines_max, bytes_max };
+    let found = if newest.is_some() { state.log.newest(wanted) } else { state.log.read(wanted) };
+    let Found { lines, next, more, lost } = found;
     Ok(LogsReport {
         name: state.ctx.config.name.clone(),
         incarnation: state.ctx.incarnation,
@@ -72,12 +74,12 @@ mod tests {
         let words = [("warn", "first"), ("info", "second"), ("error", "third")];
         assert_eq!(texts(&all), words.map(|(level, text)| pair(level, text)));
         assert!(all.lines.iter().all(|line| line.at_ns <= all.now_ns && line.number < all.next));
-        let severe = AskLogs { from: 0, level: Some("warn".to_owned()) };
+        let severe = AskLogs { level: Some("warn".to_owned()), ..AskLogs::default() };
         let severe = ask(&severe).expect("it is a question");
         assert_eq!(texts(&severe), [pair("warn", "first"), pair("error", "third")]);
-        let later = ask(&AskLogs { from: all.next, level: None }).expect("it is a question");
+        let later = ask(&AskLogs { from: all.next, ..AskLogs::default() }).expect("it is a question");
         assert!(texts(&later).is_empty());
-        let wrong = AskLogs { from: 0, level: Some("loud".to_owned()) };
+        let wrong = AskLogs { level: Some("loud".to_owned()), ..AskLogs::default() };
         assert_eq!(ask(&wrong), Err(Rejection::Malformed));
     }
 }

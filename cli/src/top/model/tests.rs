@@ -106,7 +106,7 @@ fn hip(seconds: u64) -> Answers {
         groups: Vec::new(),
         groups_left_out: 0,
     };
-    Answers { node, apps, tree: tree(), audit }
+    Answers { node, apps, tree: tree(), audit, log: Vec::new() }
 }
 
 fn snapshot(hip: Answers) -> Snapshot {

@@ -22,7 +22,7 @@ pub const LOG_LINES_MAX: usize = 256;
 /// /// Returns the warnings and errors since the last call, and keeps the number of the next line.
 /// fn warnings(endpoint: &mut Endpoint, node: NodeAddress, from: &mut u64) -> Result<LogsReport, ApiError> {
 ///     let inspect = Tid::new(node, AppAddress::INSPECT);
-///     let question = AskLogs { from: *from, level: Some("warn".to_owned()) };
+///     let question = AskLogs { from: *from, level: Some("warn".to_owned()), newest: None };
 ///     let report: LogsReport = endpoint.message(inspect, &question).ask(Duration::from_secs(1))?;
 ///     *from = report.next;
 ///     Ok(report)
@@ -36,6 +36,9 @@ pub struct AskLogs {
     /// The least severe level: `error`, `warn`, `info`, `debug`, `trace`. `None`: all levels.
     #[serde(default)]
     pub level: Option<String>,
+    /// Only so many of the newest lines; then `from` does not count. `None`: all from `from` on.
+    #[serde(default)]
+    pub newest: Option<u32>,
 }
 
 impl Payload for AskLogs {
