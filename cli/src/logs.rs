@@ -101,10 +101,9 @@ pub(crate) fn show(system: &mut System, order: &Order, is_json: bool) -> Result<
         if !reader.print(is_last) || is_last {
             break;
         }
-        if has_more {
-            continue;
+        if !has_more {
+            std::thread::sleep(PERIOD);
         }
-        std::thread::sleep(PERIOD);
         if Time::now() >= nodes_due {
             // Without an answer of the entry node the known nodes are asked again.
             if let Ok(here) = system.here() {
@@ -202,7 +201,7 @@ impl<'o> Reader<'o> {
             if is_last { u64::MAX } else { read.map(|source| source.read_ns).min().unwrap_or(u64::MAX) };
         let wall = Wall::now();
         for entry in self.merge.release(until_ns) {
-            let name = self.sources.get(&entry.node).map_or("", |source| &source.name);
+            let name = self.sources.get(&entry.node).map_or("", |source| source.name.as_str());
             if entry.at_ns >= self.since_ns && !self.screen.entry(wall, name, &entry) {
                 return false;
             }
