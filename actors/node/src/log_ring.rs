@@ -286,7 +286,7 @@ mod tests {
         for from in [5, u64::MAX] {
             assert_eq!(numbers(&kept.read(all(from))), [1, 2, 3]);
         }
-        let empty = super::LogRing::new(0).read(all(u64::MAX));
+        let empty = LogRing::new(0).read(all(u64::MAX));
         assert_eq!(empty, Found { next: 1, ..Found::default() });
     }
 

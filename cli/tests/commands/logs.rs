@@ -52,7 +52,7 @@ fn lines_of_all_nodes_are_merged_by_time() {
     assert!(!text.contains(" hip sinew"), "{text}");
     let severe = scenario.sinew("hip", &["logs", "--level", "warn", "--json"]);
     let is_severe = |line: &Value| ["warn", "error"].into_iter().any(|level| line["level"] == level);
-    assert!(self::lines(&severe).iter().all(is_severe), "{}", severe.out);
+    assert!(lines(&severe).iter().all(is_severe), "{}", severe.out);
 }
 
 #[test]
