@@ -4,7 +4,7 @@ use std::{path::PathBuf, time::Duration};
 
 use clap::{CommandFactory as _, FromArgMatches as _, Parser, Subcommand};
 
-use crate::{bag, keys, param, play, record, send, view, watch, why};
+use crate::{bag, keys, logs, param, play, record, send, view, watch, why};
 
 /// Shows a running Sinew system, from any one node of it. It changes nothing, except that `send` and `play` send
 /// messages, `param` and the page of `view` set parameters, and `keys`, `record` and `bag` write files.
@@ -94,6 +94,25 @@ pub(crate) enum Command {
   sinew watch knee.drive --wait               also where nothing has this name yet
   sinew watch knee.drive --json | jq .payload"#)]
     Watch(watch::Order),
+    /// Shows the log lines of all nodes in the order of time: time, level, node, part of the program, text
+    ///
+    /// Each node keeps its newest lines in memory, at most 2,048. Missing ones are counted, and a node that cannot be
+    /// asked is named. Times are those of this host: the clocks of other nodes are measured. With --json each line is
+    /// an object.
+    #[command(after_help = r#"Examples:
+  sinew logs
+  sinew logs -f --since 10s
+  sinew logs --node knee --level warn
+  sinew logs -f --json | jq -r 'select(.level == "error") | .text'"#)]
+    Logs(logs::Order),
+    /// Shows nodes, applications, links and losses on the terminal, twice a second: rates, queues, lateness, guards
+    ///
+    /// Keys: q ends it, the arrows and the page keys scroll, / filters the rows by a text, p pauses. Where standard
+    /// output is no terminal, or with --json, it prints one table of the rates within a second, and ends.
+    #[command(after_help = r#"Examples:
+  sinew top
+  sinew top --json | jq '.losses'"#)]
+    Top,
     /// Records the messages of the node's applications into an MCAP file, until Ctrl-C
     ///
     /// The node writes its messages into memory, and this command writes them to the file: no sender waits for it.
@@ -291,6 +310,8 @@ Examples:
   sinew ping knee.drive --count 1000
   sinew send knee.drive demo.angle '{\"degrees\": 5}'
   sinew watch knee.drive --received
+  sinew logs -f --since 10s
+  sinew top
   sinew record walk.mcap --for 30s
   sinew play walk.mcap --rate 0.5
   sinew why hip knee.drive

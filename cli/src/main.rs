@@ -5,7 +5,7 @@
 //! its access list again, and `param` sets parameters of applications. `record` has the node record its messages,
 //! and writes them to a file. `play` sends them again, by a node of its own unless told otherwise. `keys` asks no
 //! node: it creates the files by which nodes authenticate each other. `bag` reads the files of recordings. `view`
-//! keeps asking all nodes, for programs that read their metrics.
+//! keeps asking all nodes, for programs that read their metrics, and `top` for its screen.
 
 #![warn(clippy::print_stdout, clippy::print_stderr)] // `output` prints: the macros panic where a pipe is closed or a disk is full.
 
@@ -15,6 +15,7 @@ mod audit;
 mod bag;
 mod doctor;
 mod keys;
+mod logs;
 mod messagepack;
 mod nodes;
 mod output;
@@ -29,6 +30,7 @@ mod send;
 mod sockets;
 mod system;
 mod table;
+mod top;
 mod tree;
 mod unknown;
 mod view;
@@ -129,6 +131,8 @@ fn run(arguments: &Arguments) -> Result<Report, SystemError> {
         Command::Watch(order) => {
             inside(&|system| watch::show(system, order, (arguments.json, arguments.wide)))
         }
+        Command::Logs(order) => inside(&|system| logs::show(system, order, arguments.json)),
+        Command::Top => top::show(arguments),
         Command::Play(order) => play::show(order, arguments),
         Command::Record(order) => inside(&|system| record::show(system, order)),
         Command::View(order) => view::show(order, arguments),

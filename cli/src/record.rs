@@ -2,7 +2,7 @@
 
 mod fetch;
 mod freeze;
-mod sizes;
+pub(crate) mod sizes;
 pub(crate) mod stop;
 
 use std::{

@@ -53,7 +53,7 @@ pub(crate) enum SystemError {
     /// A recording cannot be read or written.
     #[error("{0}")]
     Bag(String),
-    /// The metrics cannot be served.
+    /// The metrics cannot be served, or the terminal cannot be used.
     #[error("{0}")]
     View(String),
     /// The command line is invalid.

@@ -25,6 +25,12 @@ impl Table {
         Self { rows: vec![heading.map(str::to_owned).to_vec()], width: Some(WIDTH), whole: &[] }
     }
 
+    /// A table that has only its heading, with as many columns as it has.
+    pub(crate) fn of(heading: &[&str]) -> Self {
+        let heading = heading.iter().map(|&cell| cell.to_owned()).collect();
+        Self { rows: vec![heading], width: Some(WIDTH), whole: &[] }
+    }
+
     /// Returns the same table with unlimited line length if `is_wide`.
     pub(crate) fn wide(mut self, is_wide: bool) -> Self {
         self.width = self.width.filter(|_| !is_wide);
@@ -39,6 +45,11 @@ impl Table {
 
     /// One more row. Line ends in the last cell are kept.
     pub(crate) fn row<const N: usize>(&mut self, cells: [String; N]) {
+        self.rows.push(cells.to_vec());
+    }
+
+    /// One more row, with as many cells as the heading has.
+    pub(crate) fn add(&mut self, cells: &[String]) {
         self.rows.push(cells.to_vec());
     }
 

@@ -48,13 +48,8 @@ pub(crate) struct Order {
 
 /// Serves the page and the metrics until the user ends it.
 pub(crate) fn show(order: &Order, arguments: &Arguments) -> Result<Report, SystemError> {
-    let (socket, api) = sockets::find(arguments.socket.as_deref())?;
-    let path = socket.display().to_string();
-    let nodes = Nodes { api, within: arguments.within(), entry: Arc::new(Entry::new(socket)) };
-    // As with other commands, a node that refuses or is silent at the start is an error.
-    if let Err(why) = nodes.snapshot().entry {
-        return Err(SystemError::NoAnswer(path, why));
-    }
+    let (nodes, _) = Nodes::enter(arguments)?;
+    let path = nodes.path();
     let server = Server::bind(order.listen).map_err(|why| {
         let listen = order.listen;
         SystemError::View(format!("{listen} cannot be listened on: {why}; choose another one with --listen"))
@@ -83,7 +78,7 @@ pub(crate) fn show(order: &Order, arguments: &Arguments) -> Result<Report, Syste
 }
 
 /// All nodes, asked through one of them.
-struct Nodes {
+pub(crate) struct Nodes {
     api: NodeApi,
     /// Time limit for each answer.
     within: Duration,
@@ -177,6 +172,25 @@ fn names(snapshot: &Snapshot) -> Names {
 }
 
 impl Nodes {
+    /// Finds the socket of a node, and returns the first snapshot.
+    ///
+    /// # Errors
+    /// As with other commands: a node that refuses or is silent at the start.
+    pub(crate) fn enter(arguments: &Arguments) -> Result<(Self, Snapshot), SystemError> {
+        let (socket, api) = sockets::find(arguments.socket.as_deref())?;
+        let nodes = Self { api, within: arguments.within(), entry: Arc::new(Entry::new(socket)) };
+        let snapshot = nodes.snapshot();
+        match &snapshot.entry {
+            Ok(_) => Ok((nodes, snapshot)),
+            Err(why) => Err(SystemError::NoAnswer(nodes.path(), why.clone())),
+        }
+    }
+
+    /// Returns the socket of the entry node.
+    pub(crate) fn path(&self) -> String {
+        self.entry.socket.display().to_string()
+    }
+
     fn ask_all(&self, questions: Questions, taken: Time) -> Result<Snapshot, String> {
         let mut first = register(&self.api, questions.left()?).map_err(|why| why.to_string())?;
         let entry = first.tid().node;

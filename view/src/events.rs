@@ -3,7 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
 use serde::Serialize;
-use sinew::{NodeAddress, inspect::Missing};
+use sinew::{NodeAddress, address::Incarnation, inspect::Missing};
 
 use crate::{
     nodes::{NodeLabels, State, bounded, rows},
@@ -15,6 +15,8 @@ use crate::{
 const EVENTS_MAX: usize = 512;
 /// Facts of one snapshot. Further ones cause no events.
 const FACTS_MAX: usize = 8_192;
+/// Nodes whose lines of the log are told apart. Beyond it the latest lines may cause events again.
+const LOGGED_MAX: usize = 1_024;
 /// Characters of the text of an event.
 const TEXT_MAX: usize = 400;
 
@@ -25,7 +27,7 @@ pub(crate) struct Event {
     pub(crate) number: u64,
     /// When it was seen, in milliseconds of the wall clock.
     pub(crate) wall_ms: u64,
-    /// `node`, `application`, `barrier`, `output`, `link` or `write`.
+    /// `node`, `application`, `barrier`, `output`, `link`, `log` or `write`.
     pub(crate) topic: &'static str,
     /// The part of the system that it is about.
     pub(crate) subject: String,
@@ -52,6 +54,8 @@ pub(crate) struct EventLog {
     events: VecDeque<Event>,
     last: u64,
     known: Option<Facts>,
+    /// The number of the latest line of each node.
+    logged: BTreeMap<NodeAddress, (Incarnation, u64)>,
 }
 
 impl EventLog {
@@ -61,6 +65,7 @@ impl EventLog {
             // Nothing is known of anything.
             return;
         }
+        self.observe_logs(snapshot, wall_ms);
         let mut new = facts(snapshot);
         let Some(known) = self.known.take() else {
             self.known = Some(new);
@@ -93,6 +98,26 @@ impl EventLog {
             }
         }
         self.known = Some(new);
+    }
+
+    /// Adds the lines of all logs since the former snapshot. Those of the first one cause no events.
+    fn observe_logs(&mut self, snapshot: &Snapshot, wall_ms: u64) {
+        let (labels, is_first) = (NodeLabels::of(snapshot), self.known.is_none());
+        if self.logged.len() > LOGGED_MAX {
+            self.logged.clear();
+        }
+        for answers in snapshot.answers() {
+            let (node, incarnation) = (answers.node.node, answers.node.incarnation);
+            let former = self.logged.get(&node).filter(|(former, _)| *former == incarnation);
+            let seen = former.map_or(0, |(_, number)| *number);
+            let latest = answers.log.iter().map(|line| line.number).max().unwrap_or(0).max(seen);
+            self.logged.insert(node, (incarnation, latest));
+            let subject = ("log", labels.get(node));
+            for line in answers.log.iter().filter(|line| !is_first && line.number > seen) {
+                let text = format!("{} {}: {}", line.level, line.target, line.text);
+                self.push(wall_ms, &subject, text, !["warn", "error"].contains(&line.level.as_str()));
+            }
+        }
     }
 
     /// Adds an event of this program, such as a set of parameters.
@@ -205,7 +230,7 @@ fn missing(missing: &[Missing]) -> Option<String> {
 
 #[cfg(test)]
 mod tests {
-    use sinew::inspect::AppReport;
+    use sinew::inspect::{AppReport, LogLine};
 
     use super::*;
     use crate::metrics::tests::{lost, snapshot};
@@ -234,6 +259,36 @@ mod tests {
         log.observe(&next, 2);
         let texts = texts(&log, 0);
         assert!(texts.contains(&"node knee: is lost: crashed".to_owned()), "{texts:?}");
+    }
+
+    #[test]
+    fn new_lines_of_a_log_are_events_once() {
+        let with = |numbers: &[u64], incarnation| {
+            let mut all = snapshot();
+            let Ok(hip) = &mut all.nodes[0].result else { panic!("it has answered") };
+            hip.node.incarnation = Incarnation(incarnation);
+            let [level, target] = ["warn", "sinew::gncl"].map(str::to_owned);
+            let line = |number: &u64| LogLine {
+                number: *number,
+                at_ns: 1,
+                level: level.clone(),
+                target: target.clone(),
+                text: format!("text {number}"),
+            };
+            hip.log = numbers.iter().map(line).collect();
+            all
+        };
+        let mut log = EventLog::default();
+        log.observe(&with(&[1, 2], 1), 1);
+        assert!(log.after(0).is_empty(), "those before the first look");
+        log.observe(&with(&[1, 2, 5], 1), 2);
+        log.observe(&with(&[2, 5], 1), 3);
+        log.observe(&with(&[], 1), 4);
+        log.observe(&with(&[5], 1), 5);
+        assert_eq!(texts(&log, 0), ["log hip: warn sinew::gncl: text 5"]);
+        // A node that was started anew numbers its lines from 1.
+        log.observe(&with(&[1], 2), 6);
+        assert_eq!(texts(&log, 1), ["log hip: warn sinew::gncl: text 1"]);
     }
 
     #[test]

@@ -5,7 +5,7 @@ use std::{collections::BTreeSet, time::Duration};
 use sinew::{
     NodeAddress, Tid, Time,
     audit::NodeAudit,
-    inspect::{AppsReport, NodeReport, TreeReport},
+    inspect::{AppsReport, LogLine, NodeReport, TreeReport},
 };
 
 /// Maximum number of nodes that are asked for one snapshot. Further ones are counted.
@@ -50,6 +50,8 @@ pub struct Answers {
     pub tree: TreeReport,
     /// The counters of its messages.
     pub audit: NodeAudit,
+    /// The newest warnings and errors of its log, oldest first. Former snapshots may have some of them.
+    pub log: Vec<LogLine>,
 }
 
 impl Snapshot {

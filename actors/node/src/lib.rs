@@ -24,6 +24,7 @@ mod handle;
 pub mod inspect;
 mod kept_parameters;
 mod layers;
+mod log_ring;
 #[cfg(test)]
 mod log_tests;
 mod node;

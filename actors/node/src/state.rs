@@ -10,6 +10,7 @@ use sinew_runtime::{
 };
 use sinew_security::SecurityState;
 
+use super::log_ring::LogRing;
 use super::real_time::RealTime;
 use super::recording::{Recording, Triggers};
 use super::root::{RootEvent, RootQueue};
@@ -42,6 +43,8 @@ pub(crate) struct NodeState {
     pub(crate) recording: Recording,
     /// The proof of real time.
     pub(crate) real_time: Arc<RealTime>,
+    /// The newest lines of the log.
+    pub(crate) log: Arc<LogRing>,
 }
 
 impl NodeState {
@@ -66,6 +69,7 @@ impl NodeState {
             types: Types::default(),
             recording: Recording::default(),
             real_time: Arc::default(),
+            log: LogRing::begin(),
         });
         state.connect();
         state

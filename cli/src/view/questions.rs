@@ -3,13 +3,16 @@
 use std::time::Duration;
 
 use sinew::{
-    Endpoint, NodeAddress, Payload, Time,
-    inspect::{AskApps, AskAudit, AskNode, AskTree, AuditReport, NodeReport},
+    AppAddress, Endpoint, NodeAddress, Payload, Tid, Time,
+    inspect::{AskApps, AskAudit, AskLogs, AskNode, AskTree, AuditReport, LogLine, LogsReport, NodeReport},
 };
 use sinew_view::{Answers, NodeAnswers};
 
 use super::SNAPSHOT_WITHIN;
 use crate::system::ask;
+
+/// Number of warnings and errors of each node in one snapshot.
+const WARNINGS: u32 = 16;
 
 /// The time limits of the questions of one snapshot.
 #[derive(Clone, Copy)]
@@ -60,6 +63,17 @@ impl Questions {
             apps: self.ask::<AskApps, _>(endpoint, node)?,
             tree: self.ask::<AskTree, _>(endpoint, node)?,
             audit: self.ask::<AskAudit, AuditReport>(endpoint, node)?.audit,
+            log: self.warnings(endpoint, node),
         })
+    }
+
+    /// Returns the newest warnings and errors of a node. An older version has none for this question.
+    fn warnings(self, endpoint: &mut Endpoint, node: NodeAddress) -> Vec<LogLine> {
+        let question =
+            AskLogs { level: Some("warn".to_owned()), newest: Some(WARNINGS), ..AskLogs::default() };
+        let Ok(left) = self.left() else { return Vec::new() };
+        let to = Tid::new(node, AppAddress::INSPECT);
+        let report = endpoint.message(to, &question).ask::<LogsReport>(left);
+        report.map(|report| report.lines).unwrap_or_default()
     }
 }

@@ -16,6 +16,7 @@ mod writer;
 pub(crate) use event::now;
 #[doc(hidden)]
 pub use event::{apart, here, is_on};
+pub(crate) use observer::show;
 pub use observer::{LogObserver, observe};
 pub use stderr::set_level;
 pub(crate) use stderr::{Line, is_replaced, write_text};

@@ -6,8 +6,8 @@ use tracing::Level;
 
 use crate::lock;
 
-/// Maximum number of observers in a process: each node of it that records is one.
-const OBSERVERS_MAX: usize = 64;
+/// Maximum number of observers in a process: each node of it has one, and one more while it records.
+const OBSERVERS_MAX: usize = 128;
 
 /// An observer of log events. It is called on the log thread, and delays later lines as long as it runs.
 pub trait LogObserver: Send + Sync {
@@ -29,7 +29,7 @@ pub fn observe(observer: &Arc<dyn LogObserver>) -> bool {
 }
 
 /// Shows an event to all observers. Its text is made only if there is one.
-pub(super) fn show(level: Level, target: &str, text: impl FnOnce() -> String) {
+pub(crate) fn show(level: Level, target: &str, text: impl FnOnce() -> String) {
     // The lock is released before any of them is called.
     let observers: Vec<_> = lock(&OBSERVERS).iter().filter_map(Weak::upgrade).collect();
     if observers.is_empty() {

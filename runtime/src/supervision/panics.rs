@@ -143,6 +143,8 @@ impl Panicked {
     /// none. A custom hook of the program is always called; without a subscriber it alone reports the panic,
     /// as it does for other panics.
     fn report(&self, former: &Former) {
+        // Without the frames: resolving their names may take a while.
+        log::show(Level::ERROR, module_path!(), || self.summary());
         let _prints = PRINTS.read();
         // A subscriber that was set after the panic receives the events of this thread.
         let has_reader = !self.reader.is::<NoSubscriber>() || log::is_replaced();

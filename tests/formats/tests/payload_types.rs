@@ -12,10 +12,10 @@ use sinew::{
     Payload,
     events::{DirectoryEvent, Down, NodeEvent, RequirementEvent, Undelivered},
     inspect::{
-        AccessReport, AppsReport, AskAccess, AskApps, AskAudit, AskFreeze, AskFrozen, AskGroups,
+        AccessReport, AppsReport, AskAccess, AskApps, AskAudit, AskFreeze, AskFrozen, AskGroups, AskLogs,
         AskMismatches, AskNode, AskReach, AskRecord, AskReload, AskSchemas, AskTree, AskWatch, AuditReport,
-        FreezeReport, FrozenReport, MismatchesReport, NodeReport, Ping, ReachReport, RecordReport,
-        ReloadReport, SchemasReport, TreeReport, WatchReport,
+        FreezeReport, FrozenReport, LogsReport, MismatchesReport, NodeReport, Ping, ReachReport,
+        RecordReport, ReloadReport, SchemasReport, TreeReport, WatchReport,
     },
     parameters::{AskParameters, ParameterList, ParameterOutcome, SetParameters},
     schema::{Schema, schema_of},
@@ -100,9 +100,9 @@ fn every_payload_type_of_this_tree_is_traced() {
         Arm BarrierStatus EmergencyStop GaitStatus Release Reset Shut
         DriveStatus DriveTick FootLoad GaitState JointSample TorqueSet
         DirectoryEvent Down NodeEvent RequirementEvent Undelivered
-        AccessReport AppsReport AskAccess AskApps AskAudit AskFreeze AskFrozen AskGroups AskMismatches AskNode AskReach
-        AskRecord AskReload AskSchemas AskTree AskWatch AuditReport FreezeReport FrozenReport MismatchesReport
-        NodeReport Ping ReachReport RecordReport ReloadReport SchemasReport TreeReport WatchReport
+        AccessReport AppsReport AskAccess AskApps AskAudit AskFreeze AskFrozen AskGroups AskLogs AskMismatches AskNode
+        AskReach AskRecord AskReload AskSchemas AskTree AskWatch AuditReport FreezeReport FrozenReport LogsReport
+        MismatchesReport NodeReport Ping ReachReport RecordReport ReloadReport SchemasReport TreeReport WatchReport
         ArriveAtBarrier BarrierAnswer LeaveBarrier
         AskParameters ParameterList ParameterOutcome SetParameters
     };

@@ -50,7 +50,7 @@ pub(super) fn add(samples: &mut Samples, snapshot: &Snapshot, rows: &[NodeRow], 
 
 /// Adds the report of a node about itself.
 pub(super) fn add_node(samples: &mut Samples, answers: &Answers, label: &str) {
-    let Answers { node, apps, tree, audit } = answers;
+    let Answers { node, apps, tree, audit, .. } = answers;
     samples.level(&NODE_STOPPING, [label], truth(node.stopping));
     samples.level(&NODE_UPTIME, [label], micros(node.up_us));
     samples.level(&NODE_TROUBLED, [label], node.troubled.into());

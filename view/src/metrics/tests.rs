@@ -102,7 +102,11 @@ pub(crate) fn snapshot() -> Snapshot {
         let (apps, tree) = (apps(&node), tree(&node));
         let audit = audit(&node);
         let (address, name) = (node.node, node.name.clone());
-        NodeAnswers { node: address, name, result: Ok(Box::new(Answers { node, apps, tree, audit })) }
+        NodeAnswers {
+            node: address,
+            name,
+            result: Ok(Box::new(Answers { node, apps, tree, audit, log: Vec::new() })),
+        }
     };
     Snapshot {
         taken: TAKEN,

@@ -22,10 +22,10 @@ use sinew_runtime::{
 use super::{
     access::{self, Readings},
     answers::Answers,
-    frozen, reach, record,
+    frozen, logs, reach, record,
     reports::{
-        AskAccess, AskApps, AskAudit, AskFreeze, AskFrozen, AskGroups, AskMismatches, AskNode, AskReach,
-        AskRecord, AskReload, AskSchemas, AskTree, AskWatch, Report, WatchReport,
+        AskAccess, AskApps, AskAudit, AskFreeze, AskFrozen, AskGroups, AskLogs, AskMismatches, AskNode,
+        AskReach, AskRecord, AskReload, AskSchemas, AskTree, AskWatch, Report, WatchReport,
     },
     types,
     watches::{Directions, GUESTS_WATCHES_MAX, NewTap, WATCHES_MAX, Watches},
@@ -136,6 +136,7 @@ fn answer(
         }
         AskFreeze::KIND => reply(answers, number, &question, |_, state| frozen::triggered(state, &question)),
         AskFrozen::KIND => reply(answers, number, &question, |_, state| frozen::fetched(state, &question)),
+        AskLogs::KIND => reply(answers, number, &question, |_, state| logs::kept(state, &question)),
         AskSchemas::KIND => reply(answers, number, &question, |_, state| types::schemas(state, &question)),
         AskMismatches::KIND => reply(answers, number, &question, |_, state| types::mismatches(state)),
         AskRecord::KIND => reply(answers, number, &question, |_, state| record::recorded(state, &question)),

@@ -17,6 +17,7 @@
 //! | INSPECT-8 | The applications that a message to many reaches are computed from the routing table by the same code that delivers such a message. Nothing is sent, so no application gets a message, nothing is counted, and no watch shows it. |
 //! | INSPECT-9 | A recording is started by a program of the node's own host and user, or of root, for at most 8 of them, and ends 5 s after its last question. It writes the selected messages into a journal. The answer has its path, and the structure of at most 32 payload types that the question names. No sender waits for it. |
 //! | INSPECT-10 | A span is frozen for a program of the node's own host and user, or of root. Frozen spans are read by such programs, and by programs of other nodes. A node sends such a question of a guest to no other node. |
+//! | INSPECT-11 | A node hands out the newest lines of its log, of any level that is logged: at most 2,048 lines and 256 KiB of text are kept. An answer has at most 256 lines and 32 KiB of text, from the requested number on, and counts the lines that are not kept. No thread that logs waits for it. |
 //!
 //! `docs/protocol/inspect.md` lists the fields.
 
@@ -24,6 +25,7 @@ mod access;
 mod answers;
 mod frozen;
 mod inspector;
+mod logs;
 mod reach;
 mod record;
 mod refused;
@@ -38,16 +40,16 @@ pub(crate) use inspector::begin;
 pub(crate) use record::recorded;
 pub use reports::{
     APPS_MAX, AccessReport, AccessVerdict, AppReport, AppsReport, AskAccess, AskApps, AskAudit, AskFreeze,
-    AskFrozen, AskGroups, AskMismatches, AskNode, AskReach, AskRecord, AskReload, AskSchemas, AskTree,
-    AskWatch, AuditReport, BarrierReport, CertificateReport, DialReport, FROZEN_BUSY, FROZEN_BYTES_MAX,
-    FROZEN_SPANS_MAX, ForeignReport, FreezeReport, FrozenFacts, FrozenPart, FrozenReport, FrozenSpan,
-    GroupReport, GuardReport, IdleReport, KindReport, LinkReport, LostEchoReport, LostReport, MismatchReport,
-    MismatchesReport, Missing, NodeReport, PEERS_MAX, PeerReport, Ping, REACHED_MAX, RECORDED_MAX,
-    ReachReport, Reached, RealTimeReport, RecordCounts, RecordReport, RecordedApp, RecordedType,
-    RecordingReport, RefusalReport, ReloadReport, RouteReport, SCHEMAS_MAX, SEEN_BYTES_MAX, SEEN_MAX,
-    SchemaReport, SchemasReport, SecurityReport, SeenMessage, SourceReport, StallReport, StreamReport,
-    TREE_MAX, TreeLine, TreeReport, TroubleReport, TypeUser, UnguardedReport, UnhandledReport, WaitReport,
-    WatchReport,
+    AskFrozen, AskGroups, AskLogs, AskMismatches, AskNode, AskReach, AskRecord, AskReload, AskSchemas,
+    AskTree, AskWatch, AuditReport, BarrierReport, CertificateReport, DialReport, FROZEN_BUSY,
+    FROZEN_BYTES_MAX, FROZEN_SPANS_MAX, ForeignReport, FreezeReport, FrozenFacts, FrozenPart, FrozenReport,
+    FrozenSpan, GroupReport, GuardReport, IdleReport, KindReport, LOG_LINES_MAX, LinkReport, LogLine,
+    LogsReport, LostEchoReport, LostReport, MismatchReport, MismatchesReport, Missing, NodeReport, PEERS_MAX,
+    PeerReport, Ping, REACHED_MAX, RECORDED_MAX, ReachReport, Reached, RealTimeReport, RecordCounts,
+    RecordReport, RecordedApp, RecordedType, RecordingReport, RefusalReport, ReloadReport, RouteReport,
+    SCHEMAS_MAX, SEEN_BYTES_MAX, SEEN_MAX, SchemaReport, SchemasReport, SecurityReport, SeenMessage,
+    SourceReport, StallReport, StreamReport, TREE_MAX, TreeLine, TreeReport, TroubleReport, TypeUser,
+    UnguardedReport, UnhandledReport, WaitReport, WatchReport,
 };
 pub use sinew_record::{PeerClock, Selection};
 

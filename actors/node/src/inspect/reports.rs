@@ -5,6 +5,7 @@ mod apps;
 mod audit;
 mod frozen;
 mod guards;
+mod logs;
 mod node;
 mod peers;
 mod reach;
@@ -20,6 +21,7 @@ pub use access::{AccessReport, AccessVerdict, AskAccess, AskReload, ReloadReport
 pub use apps::{APPS_MAX, AppReport, AppsReport, AskApps, BarrierReport, KindReport, Missing, WaitReport};
 pub use audit::{AskAudit, AuditReport};
 pub use guards::GuardReport;
+pub use logs::{AskLogs, LOG_LINES_MAX, LogLine, LogsReport};
 pub use node::{AskNode, NodeReport, PEERS_MAX};
 pub use peers::{
     DialReport, ForeignReport, IdleReport, LinkReport, LostReport, PeerReport, RouteReport, SourceReport,

@@ -1,15 +1,15 @@
 //! The report of a panic without a subscriber to the log.
 
-use std::sync::mpsc::sync_channel;
+use std::sync::{Arc, Mutex, mpsc::sync_channel};
 
 use actix::{Actor, Handler};
 use sinew_runtime::{
     app::{AppContext, AppSpec, Delivery},
-    log,
+    log::{self, LogObserver, observe},
     supervision::Reason,
 };
 
-use super::{is_alone, reader::Reader, run_alone};
+use super::{alone, is_alone, reader::Reader, run_alone};
 use sinew_runtime_tests::{DEADLINE, Number, Stage};
 
 struct Fragile;
@@ -69,6 +69,31 @@ fn panic_is_reported_once_with_actor_place_and_frames() {
     }
     let text = error_output(test, &[("RUST_BACKTRACE", "full")]);
     assert!(count(&text, "sinew_runtime::") > 3, "all frames: {text}");
+}
+
+/// Keeps the texts of all errors.
+#[derive(Default)]
+struct Errors(Mutex<Vec<String>>);
+
+impl LogObserver for Errors {
+    fn wrote(&self, level: log::tracing::Level, _: &str, text: &str) {
+        if level == log::tracing::Level::ERROR {
+            self.0.lock().unwrap().push(text.to_owned());
+        }
+    }
+}
+
+#[test]
+fn panic_is_shown_to_observers_once() {
+    alone("backtraces::panic_is_shown_to_observers_once", || {
+        let errors = Arc::new(Errors::default());
+        let observer: Arc<dyn LogObserver> = errors.clone();
+        assert!(observe(&observer));
+        panic_once();
+        let errors = errors.0.lock().unwrap();
+        let panics: Vec<_> = errors.iter().filter(|text| text.contains("this is to be read")).collect();
+        assert!(panics.len() == 1 && panics[0].contains("the actor 'fragile' on thread "), "{errors:?}");
+    });
 }
 
 #[test]
