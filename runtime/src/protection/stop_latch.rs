@@ -1,0 +1,156 @@
+//! The latch of a node's stop, which its guarded outputs read without a lock.
+
+use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
+
+use super::safe_output::wake;
+use crate::stop::StopState;
+
+/// Bits of the state in the word; the others count the presses.
+const STATE_BITS: u32 = 2;
+const RELEASED: u64 = 0;
+const HELD: u64 = 1;
+const STOPPED: u64 = 2;
+const STATE: u64 = (1 << STATE_BITS) - 1;
+
+/// The latch of one node's stop.
+///
+/// An output compares the number of presses with the one that its application has acknowledged. So it becomes safe also
+/// after a press that was released before the output was looked at.
+#[derive(Debug, Default)]
+pub struct StopLatch {
+    /// The number of presses, and the state.
+    ///
+    /// SYNC: sequentially consistent, as is `not_safe`: a thread that arms an output counts it there and then reads
+    /// this word; one that presses writes this word and then reads the count. So one of them sees the other.
+    word: AtomicU64,
+    /// Number of outputs that are live, or of which the safe function has failed.
+    not_safe: AtomicUsize,
+}
+
+/// The state of a latch at one moment.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Latched(u64);
+
+impl Latched {
+    /// Returns the number of presses so far.
+    #[inline]
+    pub(crate) const fn presses(self) -> u64 {
+        self.0 >> STATE_BITS
+    }
+
+    /// Returns whether outputs may be armed.
+    #[inline]
+    pub(crate) const fn is_released(self) -> bool {
+        self.0 & STATE == RELEASED
+    }
+
+    /// Returns whether a stop is in force.
+    #[must_use]
+    #[inline]
+    pub const fn is_stopped(self) -> bool {
+        self.0 & STATE == STOPPED
+    }
+
+    /// Returns the state, for reports.
+    #[must_use]
+    pub const fn state(self) -> StopState {
+        match self.0 & STATE {
+            RELEASED => StopState::Released,
+            HELD => StopState::Held,
+            _ => StopState::Stopped,
+        }
+    }
+
+    const fn of(presses: u64, state: u64) -> u64 {
+        presses << STATE_BITS | state
+    }
+}
+
+impl StopLatch {
+    /// Reads the latch.
+    #[must_use]
+    #[inline]
+    pub fn read(&self) -> Latched {
+        Latched(self.word.load(Ordering::SeqCst))
+    }
+
+    /// Stops: all outputs of the node become safe. It takes no lock and allocates nothing, so any thread may call it.
+    /// Returns its state by this press.
+    pub fn press(&self) -> Latched {
+        let pressed = |word| Latched::of(Latched(word).presses() + 1, STOPPED);
+        let before = self.word.fetch_update(Ordering::SeqCst, Ordering::SeqCst, |word| Some(pressed(word)));
+        wake();
+        // It always succeeds, as the closure returns a value.
+        Latched(pressed(before.unwrap_or_default()))
+    }
+
+    /// Ends the stop that `seen` was read in. Returns `false` if another press came after that: the latch stays.
+    /// Outputs stay safe until their applications acknowledge the stop and arm them.
+    pub fn release(&self, seen: Latched) -> bool {
+        let released = Latched::of(seen.presses(), HELD);
+        let (ordering, failed) = (Ordering::SeqCst, Ordering::SeqCst);
+        seen.is_stopped() && self.word.compare_exchange(seen.0, released, ordering, failed).is_ok()
+    }
+
+    /// Permits or forbids to arm outputs while no stop is in force. Outputs that are live stay so.
+    pub fn hold(&self, is_held: bool) {
+        let state = if is_held { HELD } else { RELEASED };
+        // A stop stays: only a release ends it.
+        let _ = self.word.fetch_update(Ordering::SeqCst, Ordering::SeqCst, |word| {
+            (!Latched(word).is_stopped()).then(|| Latched::of(Latched(word).presses(), state))
+        });
+    }
+
+    /// Returns the number of outputs that are live, or of which the safe function has failed. After
+    /// [`press`](Self::press) zero means that all are safe.
+    #[must_use]
+    pub fn not_safe(&self) -> usize {
+        self.not_safe.load(Ordering::SeqCst)
+    }
+
+    /// Counts an output that begins to be live, or that cannot be made safe.
+    pub(crate) fn count(&self) {
+        self.not_safe.fetch_add(1, Ordering::SeqCst);
+    }
+
+    /// Counts an output that is safe again.
+    pub(crate) fn discount(&self) {
+        self.not_safe.fetch_sub(1, Ordering::SeqCst);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn press_between_reading_and_release_wins() {
+        let latch = StopLatch::default();
+        latch.press();
+        let seen = latch.read();
+        latch.press();
+        assert!(!latch.release(seen) && latch.read().is_stopped());
+        assert!(latch.release(latch.read()) && !latch.read().is_stopped());
+    }
+
+    #[test]
+    fn release_permits_nothing_before_the_hold_ends() {
+        let latch = StopLatch::default();
+        assert!(latch.read().is_released(), "a process without a node is not held");
+        latch.press();
+        latch.hold(false);
+        assert!(latch.read().is_stopped(), "the end of a hold is no release");
+        assert!(latch.release(latch.read()) && !latch.read().is_released());
+        latch.hold(false);
+        assert!(latch.read().is_released());
+        latch.hold(true);
+        assert!(!latch.read().is_released() && !latch.read().is_stopped());
+    }
+
+    #[test]
+    fn release_without_a_stop_changes_nothing() {
+        let latch = StopLatch::default();
+        assert!(!latch.release(latch.read()));
+        assert_eq!(latch.read().presses(), 0);
+    }
+}
