@@ -56,8 +56,10 @@ impl Tap for RecordTap {
     fn saw(&self, app: Tid, passage: &Passage<'_>) {
         let Passage { header, payload, length, refused, .. } = *passage;
         let (source, destination) = (header.source, header.destination);
-        // A program that reads a recording must not fill the ring with its own questions.
-        if [source, destination].iter().any(|party| party.app == AppAddress::INSPECT) {
+        let has = |app: AppAddress| [source, destination].map(|party| party.app == app);
+        // A program that reads a recording must not fill the ring with its own questions, nor must the nodes with the
+        // states of the stop that they exchange: a press is in the log, and is a trigger.
+        if has(AppAddress::INSPECT).contains(&true) || has(AppAddress::STOP) == [true; 2] {
             return;
         }
         if !self.chosen.has(source, destination, header.kind) && !self.chosen.has(app, app, header.kind) {
