@@ -5,3 +5,4 @@ mod black_channel;
 mod nodes;
 mod processes;
 mod recordings;
+mod stop;

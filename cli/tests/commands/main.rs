@@ -14,6 +14,7 @@ mod reference;
 mod scenario;
 mod secured;
 mod send;
+mod stop;
 mod view;
 mod watch;
 mod why;
