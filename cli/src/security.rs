@@ -151,6 +151,7 @@ pub(crate) mod tests {
             unguarded: Vec::new(),
             lost_echoes: Vec::new(),
             real_time: None,
+            stop: None,
             guards: Vec::new(),
             guards_left_out: 0,
             refusals_left_out: 0,

@@ -98,6 +98,8 @@ pub(super) const NODE_LATENESS: Metric = seconds(
     &["node", "quantile"],
     "Time by which a thread woke late at 1 kHz after the start of the node.",
 );
+pub(super) const NODE_STOPPED: Metric =
+    gauge("node_stopped", NODE, "Whether the stop of the whole system is in force at the node.");
 pub(super) const NODE_IDLE_CLIENTS: Metric =
     gauge("node_idle_clients", NODE, "Clients that do not read their queued messages.");
 pub(super) const REFUSED: Metric =
@@ -200,6 +202,7 @@ pub const METRICS: &[Metric] = &[
     NODE_STALLS,
     NODE_STALL_LONGEST,
     NODE_FIFO,
+    NODE_STOPPED,
     NODE_LATENESS,
     NODE_TROUBLED,
     NODE_IDLE_CLIENTS,

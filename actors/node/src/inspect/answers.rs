@@ -112,6 +112,7 @@ impl Answers {
             unguarded: refused::unguarded(state, now),
             lost_echoes: refused::lost_echoes(state, now),
             real_time: state.real_time.report(),
+            stop: Some(state.ctx.router.stop().read().state()),
             guards,
             guards_left_out,
             peers,
