@@ -3,7 +3,7 @@
 use exoskeleton_model::message::DriveState;
 use sinew::prelude::*;
 
-use super::Drive;
+use super::{Drive, command::CentralCommands};
 use crate::robot::edges::{EmergencyStop, Reset};
 
 impl Drive {
@@ -40,8 +40,7 @@ impl Handler<Delivery<Reset>> for Drive {
             return;
         }
         // The person at central starts again: that acknowledges a stop of the whole system which is released.
-        let acknowledged =
-            self.commands.as_ref().map_or(Ok(()), |commands| commands.guard.acknowledge_stop());
+        let acknowledged = self.commands.as_ref().map_or(Ok(()), CentralCommands::acknowledge_stop);
         if let Err(refusal) = acknowledged {
             tracing::warn!(joint = %self.parts.joint, %refusal, "the drive stays stopped");
             context.reject();
