@@ -197,7 +197,10 @@ impl<O: Send + 'static> Guard<O> {
         inner.make_safe(Cause::NotArmed, clock.now());
         inner.log_entry.take().into_iter().for_each(LogEntry::log);
         let deadline = inner.deadline();
-        let watch = WatchState::new(deadline, inner.retry.is_some(), stop.clone(), protected.protection);
+        let watch = {
+            let stop = (stop.clone(), destination);
+            WatchState::new(deadline, inner.retry.is_some(), stop, protected.protection)
+        };
         let watch = Arc::new(watch);
         let shared = Arc::new_cyclic(|output| Shared {
             data_id,

@@ -22,6 +22,7 @@ use super::{
 };
 use crate::{
     supervision::{realtime_priority, set_highest_priority},
+    tid::Tid,
     time::Time,
 };
 
@@ -64,12 +65,10 @@ impl WatchState {
     pub(super) fn new(
         deadline: u64,
         needs_retry: bool,
-        stop: Arc<StopLatch>,
+        (stop, app): (Arc<StopLatch>, Tid),
         protection: Protection,
     ) -> Self {
-        let now = stop.read();
-        // An output that is made during a stop has to acknowledge it, too.
-        let acknowledged = if now.is_stopped() { now.presses().wrapping_sub(1) } else { now.presses() };
+        let acknowledged = stop.acknowledged(app);
         let state = Self {
             deadline: AtomicU64::new(deadline),
             is_tripped: AtomicBool::new(false),
@@ -97,13 +96,16 @@ impl WatchState {
         self.stop.read().is_released() && !self.must_stop()
     }
 
-    /// Acknowledges all presses so far, if no stop is in force. A later press counts again.
-    pub(super) fn acknowledge(&self) -> bool {
+    /// Acknowledges all presses so far, if no stop is in force, for this output and those that `app` makes later. A
+    /// later press counts again.
+    pub(super) fn acknowledge(&self, app: Tid) -> bool {
         let now = self.stop.read();
         if now.is_stopped() {
             return false;
         }
-        self.acknowledged.store(now.presses(), Ordering::SeqCst);
+        if self.acknowledged.swap(now.presses(), Ordering::SeqCst) != now.presses() {
+            self.stop.record_acknowledged(app, now.presses());
+        }
         true
     }
 

@@ -1,10 +1,19 @@
 //! The latch of a node's stop, which its guarded outputs read without a lock.
 
-use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
+use std::{
+    collections::BTreeMap,
+    sync::{
+        Mutex,
+        atomic::{AtomicU64, AtomicUsize, Ordering},
+    },
+};
 
 use super::safe_output::wake;
-use crate::stop::StopState;
+use crate::{lock, stop::StopState, tid::Tid};
 
+/// Maximum number of applications with outputs that have acknowledged a stop. Beyond it the outputs that they make
+/// later have to be acknowledged again.
+const ACKNOWLEDGED_MAX: usize = 1_024;
 /// Bits of the state in the word; the others count the presses.
 const STATE_BITS: u32 = 2;
 const RELEASED: u64 = 0;
@@ -25,6 +34,9 @@ pub struct StopLatch {
     word: AtomicU64,
     /// Number of outputs that are live, or of which the safe function has failed.
     not_safe: AtomicUsize,
+    /// The numbers of presses that applications have acknowledged, for the outputs that they make later. A press does
+    /// not take this lock.
+    acknowledged: Mutex<BTreeMap<Tid, u64>>,
 }
 
 /// The state of a latch at one moment.
@@ -106,6 +118,21 @@ impl StopLatch {
     #[must_use]
     pub fn not_safe(&self) -> usize {
         self.not_safe.load(Ordering::SeqCst)
+    }
+
+    /// Returns the number of presses that `app` has acknowledged: an output that it makes after a stop, for instance
+    /// because it was restarted, is not armed without the acknowledgement either.
+    pub(crate) fn acknowledged(&self, app: Tid) -> u64 {
+        lock(&self.acknowledged).get(&app).copied().unwrap_or(0)
+    }
+
+    /// Records that `app` has acknowledged this number of presses.
+    pub(crate) fn record_acknowledged(&self, app: Tid, presses: u64) {
+        let mut acknowledged = lock(&self.acknowledged);
+        if acknowledged.len() >= ACKNOWLEDGED_MAX && !acknowledged.contains_key(&app) {
+            acknowledged.clear();
+        }
+        acknowledged.insert(app, presses);
     }
 
     /// Counts an output that begins to be live, or that cannot be made safe.

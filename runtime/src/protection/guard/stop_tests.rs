@@ -112,6 +112,28 @@ fn output_made_during_a_stop_is_acknowledged_too() {
 }
 
 #[test]
+fn output_made_after_a_release_is_acknowledged_too() {
+    let first = live();
+    first.stop.press();
+    assert!(first.stop.release(first.stop.read()));
+    first.stop.hold(false);
+    // The application is started anew before a person has started again
+    let Bench { stop, guard, .. } = first;
+    drop(guard);
+    let second = Bench::new(&stop, |(), _| {});
+    assert!(second.guard.is_stopped());
+    assert_eq!(second.arm(), Err(ArmError::Stopped));
+    assert_eq!(second.guard.acknowledge_stop(), Ok(()));
+    assert_eq!(second.arm(), Ok(()));
+    // And once more after that
+    drop(second.guard);
+    let third = Bench::new(&stop, |(), _| {});
+    assert_eq!(third.arm(), Ok(()), "the application has acknowledged this stop");
+    stop.press();
+    assert_eq!(third.guard.state(), State::Safe(Cause::Stopped), "but not the next one");
+}
+
+#[test]
 fn held_node_arms_nothing_and_leaves_live_outputs() {
     let bench = live();
     bench.stop.hold(true);
