@@ -45,8 +45,9 @@ pub struct Latched(u64);
 
 impl Latched {
     /// Returns the number of presses so far.
+    #[must_use]
     #[inline]
-    pub(crate) const fn presses(self) -> u64 {
+    pub const fn presses(self) -> u64 {
         self.0 >> STATE_BITS
     }
 

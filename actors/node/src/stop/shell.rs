@@ -6,7 +6,7 @@ use sinew_model::{config::NodeConfig, leave_reason::LeaveReason, refusals::BY_LI
 use sinew_runtime::{
     log,
     outcome::{Outcome, Rejection},
-    protection::{Latched, stopped_outputs},
+    protection::{Latched, StopLatch, stopped_outputs},
     stop::{AcknowledgeStop, AskStop, PressStop, ReleaseStop, StopReport, StopState},
     tid::{AppAddress, NodeAddress, Tid},
     time::Time,
@@ -62,8 +62,9 @@ pub(super) struct Shell {
     core: Core,
     kept: Kept,
     waiting: Vec<Waiting>,
-    /// The latch at the begin of this turn: a release ends no press that came after it.
-    seen: Latched,
+    /// The latch with the presses that the core knows: a release ends no other one. So a press of an application
+    /// whose message was refused outlasts it.
+    covered: Latched,
     /// Number of frames and answers that were sent.
     sent: u64,
 }
@@ -81,7 +82,7 @@ impl Shell {
         };
         let (kept, stops) = Kept::begin(&state.ctx);
         let core = Core::new(own, stops, now);
-        Self { core, kept, waiting: Vec::new(), seen: state.ctx.router.stop().read(), sent: 0 }
+        Self { core, kept, waiting: Vec::new(), covered: state.ctx.router.stop().read(), sent: 0 }
     }
 
     /// Returns how long the thread may sleep.
@@ -99,14 +100,14 @@ impl Shell {
 
     /// Handles an event, and all that has become due.
     pub(super) fn turn(&mut self, state: &Arc<NodeState>, now: Time, event: Option<Event>) {
-        self.seen = state.ctx.router.stop().read();
         match event {
             Some(Event::Message(message)) => self.receive(state, now, message),
             Some(Event::Nodes(nodes)) => self.handle(state, now, Input::NodesSeen(nodes)),
             None => self.handle(state, now, Input::TimePassed),
         }
         if state.ctx.router.stop().read().is_stopped() && !self.core.is_stopped() {
-            // An application has set the latch itself, and its message is not there yet, or was refused.
+            // An application has set the latch itself, and its message is not there yet, or was refused. Or it did so
+            // while another stop was in force that is released now.
             let by = Tid::new(state.ctx.node, AppAddress::STOP);
             let reason = LeaveReason::of("an application of this node pressed");
             self.handle(state, now, Input::Pressed { by, reason });
@@ -120,14 +121,25 @@ impl Shell {
     }
 
     fn handle(&mut self, state: &Arc<NodeState>, now: Time, input: Input) {
+        let latch = state.ctx.router.stop();
+        if matches!(input, Input::Pressed { .. }) {
+            // It stands for those that applications have set so far.
+            self.covered = latch.read();
+        }
         self.core.handle(now, input);
+        let mut is_pressed = false;
         while let Some(order) = self.core.poll() {
             match order {
-                Output::SetLatch(to) => self.set_latch(state, now, to),
+                Output::SetLatch(StopState::Stopped) => {
+                    self.covered = press_once(latch).unwrap_or(self.covered);
+                    is_pressed = true;
+                }
+                Output::SetLatch(to) => self.end_stop(latch, to),
                 Output::PassStop => {
-                    let latch = state.ctx.router.stop();
-                    // A press of an application meanwhile stays.
-                    latch.release(latch.press());
+                    // A press of an application before or meanwhile stays.
+                    if let Some(passed) = press_once(latch) {
+                        latch.release(passed);
+                    }
                     latch.hold(self.core.latched() == StopState::Held);
                     log::warn!(
                         "a stop was pressed and released while this node was away: its outputs become safe"
@@ -137,26 +149,26 @@ impl Shell {
                 Output::Keep => self.kept.keep(self.core.stops()),
             }
         }
+        if is_pressed {
+            // After the other nodes know.
+            self.note_press(state, now);
+        }
     }
 
-    fn set_latch(&mut self, state: &NodeState, now: Time, to: StopState) {
-        let latch = state.ctx.router.stop();
-        if to == StopState::Stopped {
-            // An application of this process may have done so itself.
-            if !latch.read().is_stopped() {
-                latch.press();
-            }
-            let report = self.core.report();
-            let press = report.presses.first();
-            let by = press.map_or(Tid::NONE, |press| press.by);
-            let reason = press.map_or_else(String::new, |press| press.reason.clone());
-            log::warn!(%by, reason, "the stop is pressed: guarded outputs become safe");
-            if let Some(flight) = state.recording.flight() {
-                flight.happened(now, &format!("the stop is pressed by {by}: {reason}"));
-            }
-            return;
+    /// Notes a press in the log and in the flight recorder.
+    fn note_press(&self, state: &NodeState, now: Time) {
+        let report = self.core.report();
+        let press = report.presses.first();
+        let by = press.map_or(Tid::NONE, |press| press.by);
+        let reason = press.map_or_else(String::new, |press| press.reason.clone());
+        log::warn!(%by, reason, "the stop is pressed: guarded outputs become safe");
+        if let Some(flight) = state.recording.flight() {
+            flight.happened(now, &format!("the stop is pressed by {by}: {reason}"));
         }
-        if self.seen.is_stopped() && latch.release(self.seen) {
+    }
+
+    fn end_stop(&self, latch: &StopLatch, to: StopState) {
+        if latch.release(self.covered) {
             log::warn!("the stop is released: outputs stay safe until their applications acknowledge it");
         }
         latch.hold(to == StopState::Held);
@@ -288,5 +300,68 @@ impl Shell {
         message.header.sequence = self.sent;
         message.header.sent = Time::now();
         state.ctx.router.send(message)
+    }
+}
+
+/// Presses, and returns the latch by that press; `None`: an application pressed before or meanwhile.
+fn press_once(latch: &StopLatch) -> Option<Latched> {
+    let before = latch.read();
+    if before.is_stopped() {
+        return None;
+    }
+    let pressed = latch.press();
+    (pressed.presses() == before.presses() + 1).then_some(pressed)
+}
+
+#[cfg(test)]
+mod tests {
+    use sinew_runtime::tid::Incarnation;
+
+    use super::*;
+
+    fn pressed(state: &Arc<NodeState>) -> Shell {
+        let mut shell = Shell::new(state, Time::now());
+        shell.turn(state, Time::now(), None);
+        press(&mut shell, state);
+        assert!(state.ctx.router.stop().read().is_stopped());
+        shell
+    }
+
+    fn press(shell: &mut Shell, state: &Arc<NodeState>) {
+        let (by, reason) = (Tid::NONE, LeaveReason::of("a test"));
+        shell.handle(state, Time::now(), Input::Pressed { by, reason });
+    }
+
+    fn release(shell: &mut Shell, state: &Arc<NodeState>) {
+        shell.handle(state, Time::now(), Input::Released { by: Tid::NONE });
+    }
+
+    #[test]
+    fn press_whose_message_was_refused_outlasts_a_release() {
+        let state = NodeState::new(NodeConfig::new("knee"), Incarnation(1));
+        let latch = state.ctx.router.stop();
+        let mut shell = pressed(&state);
+        // When: an application presses while a stop is in force, and no message of it arrives
+        latch.press();
+        release(&mut shell, &state);
+        assert!(latch.read().is_stopped() && !shell.core.is_stopped());
+        // Then: the node presses for it
+        shell.turn(&state, Time::now(), None);
+        assert!(shell.core.is_stopped());
+        release(&mut shell, &state);
+        assert!(!latch.read().is_stopped());
+    }
+
+    #[test]
+    fn press_with_its_message_is_released_with_it() {
+        let state = NodeState::new(NodeConfig::new("knee"), Incarnation(1));
+        let latch = state.ctx.router.stop();
+        let mut shell = pressed(&state);
+        latch.press();
+        press(&mut shell, &state);
+        release(&mut shell, &state);
+        assert!(!latch.read().is_stopped());
+        shell.turn(&state, Time::now(), None);
+        assert!(!shell.core.is_stopped());
     }
 }
