@@ -2,7 +2,7 @@
 
 use std::{sync::Arc, time::Duration};
 
-use sinew_model::{config::NodeConfig, leave_reason::LeaveReason, refusals::BY_LIST};
+use sinew_model::{config::NodeConfig, facts::LossReason, leave_reason::LeaveReason, refusals::BY_LIST};
 use sinew_runtime::{
     log,
     outcome::{Outcome, Rejection},
@@ -31,22 +31,16 @@ const LOOKS_FOR: Duration = Duration::from_millis(50);
 const IDLE: Duration = Duration::from_secs(2);
 /// Time after which the thread hands over entries again that wait for the disk.
 const DISK_RETRY: Duration = Duration::from_millis(20);
+/// Time after which the known nodes are read again if the discovery was busy.
+const NODES_RETRY: Duration = Duration::from_millis(10);
 /// Maximum number of applications that wait for confirmations; a further one is answered at once.
 const WAITING_MAX: usize = 32;
 /// Maximum wait for confirmations.
 const WITHIN_MAX: Duration = Duration::from_secs(60);
 
-/// Returns the time between two looks at the known nodes: a node that is found is known before the hold at the start
-/// ends.
-pub(super) fn look_period(config: &NodeConfig) -> Duration {
+/// Returns the time between two looks at the known nodes.
+fn look_period(config: &NodeConfig) -> Duration {
     (config.ndl.period / 2).clamp(Duration::from_millis(10), Duration::from_millis(250))
-}
-
-/// An event of the thread.
-pub(super) enum Event {
-    Message(Message),
-    /// The nodes that the discovery knows.
-    Nodes(Vec<SeenNode>),
 }
 
 /// An application that waits for all nodes.
@@ -62,6 +56,8 @@ pub(super) struct Shell {
     core: Core,
     kept: Kept,
     waiting: Vec<Waiting>,
+    /// When the known nodes are read next.
+    nodes_due: Time,
     /// The latch with the presses that the core knows: a release ends no other one. So a press of an application
     /// whose message was refused outlasts it.
     covered: Latched,
@@ -82,12 +78,20 @@ impl Shell {
         };
         let (kept, stops) = Kept::begin(&state.ctx);
         let core = Core::new(own, stops, now);
-        Self { core, kept, waiting: Vec::new(), covered: state.ctx.router.stop().read(), sent: 0 }
+        Self {
+            core,
+            kept,
+            waiting: Vec::new(),
+            nodes_due: now,
+            covered: state.ctx.router.stop().read(),
+            sent: 0,
+        }
     }
 
     /// Returns how long the thread may sleep.
     pub(super) fn rests(&self, now: Time, stopped_since: Option<Time>) -> Duration {
         let wakes = self.core.next_wake().into_iter().chain(self.waiting.iter().map(|one| one.until));
+        let wakes = wakes.chain([self.nodes_due]);
         let idle = if self.kept.is_pending() { DISK_RETRY } else { IDLE };
         let rests = wakes.map(|at| at.since(now)).min().unwrap_or(idle).min(idle);
         let is_recent = stopped_since.is_some_and(|since| now.since(since) < LOOKS_FOR);
@@ -98,13 +102,13 @@ impl Shell {
         }
     }
 
-    /// Handles an event, and all that has become due.
-    pub(super) fn turn(&mut self, state: &Arc<NodeState>, now: Time, event: Option<Event>) {
-        match event {
-            Some(Event::Message(message)) => self.receive(state, now, message),
-            Some(Event::Nodes(nodes)) => self.handle(state, now, Input::NodesSeen(nodes)),
+    /// Handles a message, and all that has become due.
+    pub(super) fn turn(&mut self, state: &Arc<NodeState>, now: Time, message: Option<Message>) {
+        match message {
+            Some(message) => self.receive(state, now, message),
             None => self.handle(state, now, Input::TimePassed),
         }
+        self.read_nodes(state, now);
         if state.ctx.router.stop().read().is_stopped() && !self.core.is_stopped() {
             // An application has set the latch itself, and its message is not there yet, or was refused. Or it did so
             // while another stop was in force that is released now.
@@ -118,6 +122,19 @@ impl Shell {
         self.handle(state, now, Input::OutputsSeen(outputs, latch.not_safe()));
         self.kept.retry();
         self.answer_waiting(state, now);
+    }
+
+    /// Reads the known nodes, if that is due. It waits for no layer: while the discovery has its lock, it is tried again.
+    fn read_nodes(&mut self, state: &Arc<NodeState>, now: Time) {
+        if now < self.nodes_due {
+            return;
+        }
+        self.nodes_due = now + NODES_RETRY;
+        let Some(nodes) = nodes(state) else { return };
+        let next = now + look_period(&state.ctx.config);
+        let hold = self.core.hold_ends();
+        self.nodes_due = if hold > now { hold.min(next) } else { next };
+        self.handle(state, now, Input::NodesSeen(nodes));
     }
 
     fn handle(&mut self, state: &Arc<NodeState>, now: Time, input: Input) {
@@ -301,6 +318,26 @@ impl Shell {
         message.header.sent = Time::now();
         state.ctx.router.send(message)
     }
+}
+
+/// Returns the present nodes, and those that were lost without a farewell; `None` while the discovery is busy.
+fn nodes(state: &NodeState) -> Option<Vec<SeenNode>> {
+    let (present, lost) = state.ctx.ports.members()?.in_brief()?;
+    let present = present.into_iter().map(|member| SeenNode {
+        node: member.node,
+        incarnation: member.incarnation,
+        name: member.name,
+        lost: None,
+    });
+    let mut nodes: Vec<_> = present.filter(|node| node.node != state.ctx.node).collect();
+    for lost in lost {
+        let is_known = nodes.iter().any(|node| node.node == lost.node);
+        if !is_known && lost.why != LossReason::Left {
+            let (node, incarnation) = (lost.node, lost.incarnation);
+            nodes.push(SeenNode { node, incarnation, name: String::new(), lost: Some(lost.why.to_string()) });
+        }
+    }
+    Some(nodes)
 }
 
 /// Presses, and returns the latch by that press; `None`: an application pressed before or meanwhile.

@@ -185,9 +185,12 @@ impl Core {
 
     /// Returns when [`Input::TimePassed`] is due at the latest.
     pub(super) fn next_wake(&self) -> Option<Time> {
-        let dues = self.peers.values().map(|peer| peer.due);
-        let hold = self.is_new.then(|| self.began + self.own.hold);
-        dues.chain(hold).min()
+        self.peers.values().map(|peer| peer.due).min()
+    }
+
+    /// Returns when the hold at the start ends, by the nodes that are seen then or later.
+    pub(super) fn hold_ends(&self) -> Time {
+        self.began + self.own.hold
     }
 
     /// Returns whether a stop is in force.
@@ -267,6 +270,8 @@ impl Core {
     }
 
     fn see(&mut self, now: Time, nodes: Vec<SeenNode>) {
+        // By what the discovery has found, and not by the time alone: the look may be late. spec: STOP-6
+        self.is_new &= now < self.hold_ends();
         let seen: BTreeSet<_> = nodes.iter().map(|node| node.node).collect();
         // One that has said farewell is no part of the system.
         self.peers.retain(|node, _| seen.contains(node));
@@ -303,7 +308,6 @@ impl Core {
 
     /// Sets the latch, and sends the states that are due.
     fn settle(&mut self, now: Time) {
-        self.is_new &= now < self.began + self.own.hold;
         let state = self.state();
         if state != self.latched {
             if state != StopState::Stopped {

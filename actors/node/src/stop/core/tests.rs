@@ -63,7 +63,7 @@ fn exchange(now: Time, from: &Core, to: &mut Core) {
 
 fn released(node: u32) -> Core {
     let mut core = Core::new(own(node), Stops::default(), at(0));
-    core.handle(at(1_000), Input::TimePassed);
+    core.handle(at(1_000), Input::NodesSeen(Vec::new()));
     assert_eq!(latches(&orders(&mut core)), [StopState::Held, StopState::Released]);
     core
 }
@@ -73,10 +73,12 @@ fn released(node: u32) -> Core {
 fn lone_node_is_held_and_then_released() {
     let mut core = Core::new(own(1), Stops::default(), at(0));
     assert_eq!(latches(&orders(&mut core)), [StopState::Held]);
-    core.handle(at(999), Input::TimePassed);
+    core.handle(at(999), Input::NodesSeen(Vec::new()));
+    assert_eq!(core.hold_ends(), at(1_000));
+    // Time alone does not tell that there are no others.
+    core.handle(at(9_000), Input::TimePassed);
     assert_eq!(latches(&orders(&mut core)), []);
-    assert_eq!(core.next_wake(), Some(at(1_000)));
-    core.handle(at(1_000), Input::TimePassed);
+    core.handle(at(9_001), Input::NodesSeen(Vec::new()));
     assert_eq!(latches(&orders(&mut core)), [StopState::Released]);
 }
 
