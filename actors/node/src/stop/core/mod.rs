@@ -111,6 +111,8 @@ struct Peer {
 pub(super) struct Core {
     own: Own,
     stops: Stops,
+    /// The number of the last press of this incarnation: no later one has it again, even if its entry is forgotten.
+    pressed: u32,
     began: Time,
     /// Whether the hold at the start lasts.
     is_new: bool,
@@ -137,6 +139,7 @@ impl Core {
             own,
             stopped_at: stops.is_open().then_some(now),
             stops,
+            pressed: 0,
             began: now,
             is_new: true,
             peers: BTreeMap::new(),
@@ -215,7 +218,7 @@ impl Core {
 
     fn press(&mut self, now: Time, by: Tid, reason: LeaveReason) {
         let Own { node, incarnation, .. } = self.own;
-        self.stops.press(Origin { node, incarnation }, by, reason);
+        self.pressed = self.stops.press(Origin { node, incarnation }, self.pressed, by, reason);
         self.begin_stop(now);
     }
 

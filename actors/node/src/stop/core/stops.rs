@@ -31,17 +31,18 @@ impl Stops {
         self.0.values()
     }
 
-    /// Adds a press of this node.
-    pub(super) fn press(&mut self, origin: Origin, by: Tid, reason: LeaveReason) {
+    /// Adds a press of this node, with a number above `last`, and returns that number.
+    pub(super) fn press(&mut self, origin: Origin, last: u32, by: Tid, reason: LeaveReason) -> u32 {
         let reason = reason.into();
         let (pressed, released, released_by) = self
             .0
             .get(&origin)
             .map_or((0, 0, Tid::NONE), |entry| (entry.pressed, entry.released, entry.released_by));
-        self.make_room();
-        let pressed = pressed.saturating_add(1);
+        let pressed = pressed.max(last).saturating_add(1);
         // Beyond the limit, too: a node's own press is never left out.
+        self.make_room(origin, true);
         self.0.insert(origin, Entry { origin, pressed, by, reason, released, released_by });
+        pressed
     }
 
     /// Releases all presses that are known here. Returns whether there was one. spec: STOP-3
@@ -59,9 +60,9 @@ impl Stops {
         for other in others {
             let released = if operators.contains(&other.released_by) { other.released } else { 0 };
             if !self.0.contains_key(&other.origin) {
-                self.make_room();
-                if self.0.len() >= ENTRIES_MAX {
-                    // All are open: this node is stopped, and does not confirm this press.
+                if !self.make_room(other.origin, other.pressed > released) {
+                    // All are open: this node is stopped, and does not confirm this press. Or it is a released one
+                    // that is forgotten.
                     continue;
                 }
                 self.0.insert(other.origin, Entry { pressed: 0, released: 0, ..other.clone() });
@@ -80,30 +81,44 @@ impl Stops {
         merged
     }
 
-    /// Returns whether these numbers have all presses that are known here.
+    /// Returns whether these numbers have all presses in force that are known here.
     pub(super) fn presses_are_in(&self, others: &[Entry]) -> bool {
-        self.are_in(others, |own, other| other.pressed >= own.pressed)
+        let others = by_origin(others);
+        let mut open = self.0.values().filter(|own| own.is_open());
+        open.all(|own| others.get(&own.origin).is_some_and(|other| other.pressed >= own.pressed))
     }
 
-    /// Returns whether these numbers have all presses and releases that are known here.
+    /// Returns whether these numbers have all presses and releases that are known here, but for released ones that a
+    /// full list has forgotten.
     pub(super) fn is_in(&self, others: &[Entry]) -> bool {
-        self.are_in(others, |own, other| other.pressed >= own.pressed && other.released >= own.released)
+        let is_full = others.len() >= ENTRIES_MAX;
+        let others = by_origin(others);
+        self.0.values().all(|own| match others.get(&own.origin) {
+            Some(other) => other.pressed >= own.pressed && other.released >= own.released,
+            None => is_full && !own.is_open(),
+        })
     }
 
-    fn are_in(&self, others: &[Entry], has: impl Fn(&Entry, &Entry) -> bool) -> bool {
-        let others: BTreeMap<_, _> = others.iter().map(|entry| (entry.origin, entry)).collect();
-        self.0.iter().all(|(origin, own)| others.get(origin).is_some_and(|other| has(own, other)))
-    }
-
-    /// Removes released entries, as far as there are as many as may be. A node that has missed its release stops the
-    /// others again: that is the safe side.
-    fn make_room(&mut self) {
+    /// Makes room for an entry: forgets the released ones of the oldest incarnations, as far as there are as many as may
+    /// be. Returns `false` if there is none: all are open, or the new one is released and older itself. So nodes that
+    /// know different ones come to the same ones, and do not replace them again and again. A node that has missed the
+    /// release of a forgotten one stops the others again: that is the safe side.
+    fn make_room(&mut self, new: Origin, is_open: bool) -> bool {
+        let age = |origin: Origin| (origin.incarnation, origin.node);
         while self.0.len() >= ENTRIES_MAX {
-            let closed = self.0.values().find(|entry| !entry.is_open()).map(|entry| entry.origin);
-            let Some(origin) = closed else { return };
-            self.0.remove(&origin);
+            let closed = self.0.values().filter(|entry| !entry.is_open()).map(|entry| entry.origin);
+            let Some(oldest) = closed.min_by_key(|origin| age(*origin)) else { return false };
+            if !is_open && age(new) < age(oldest) {
+                return false;
+            }
+            self.0.remove(&oldest);
         }
+        true
     }
+}
+
+fn by_origin(entries: &[Entry]) -> BTreeMap<Origin, &Entry> {
+    entries.iter().map(|entry| (entry.origin, entry)).collect()
 }
 
 impl FromIterator<Entry> for Stops {
@@ -131,7 +146,7 @@ mod tests {
     }
 
     fn press(stops: &mut Stops, node: u32) {
-        stops.press(origin(node), tid(node), LeaveReason::of("a test"));
+        stops.press(origin(node), 0, tid(node), LeaveReason::of("a test"));
     }
 
     fn entries(stops: &Stops) -> Vec<Entry> {
@@ -208,6 +223,49 @@ mod tests {
         assert_eq!(one.merge(&entries(&other), &operators()), Merged::default());
         assert!(one.is_open() && !one.is_in(&entries(&Stops::default())));
         assert!(!other.is_in(&entries(&one)) && other.presses_are_in(&entries(&one)));
+    }
+
+    /// A list of released presses of these nodes.
+    fn released(nodes: std::ops::Range<u32>) -> Stops {
+        let mut stops = Stops::default();
+        for node in nodes {
+            press(&mut stops, node);
+            stops.release(tid(1));
+        }
+        stops
+    }
+
+    #[test]
+    fn full_lists_of_released_presses_become_equal() {
+        let full = ENTRIES_MAX as u32;
+        let (mut one, mut other) = (released(0..full), released(full / 2..full * 2));
+        for _ in 0..2 {
+            one.merge(&entries(&other), &operators());
+            other.merge(&entries(&one), &operators());
+        }
+        assert_eq!(one, other);
+        assert_eq!(one.merge(&entries(&other), &operators()), Merged::default());
+        // A forgotten one does not come back, and is not waited for.
+        let old = released(0..1);
+        assert_eq!(one.merge(&entries(&old), &operators()), Merged::default());
+        assert!(old.is_in(&entries(&one)) && !old.is_in(&[]));
+        // A press that is in force has room, and counts for the confirmation.
+        let mut late = old;
+        press(&mut late, 0);
+        assert!(!late.presses_are_in(&entries(&one)) && !late.is_in(&entries(&one)));
+        assert!(one.merge(&entries(&late), &operators()).has_press && late.presses_are_in(&entries(&one)));
+    }
+
+    #[test]
+    fn number_of_a_forgotten_press_is_not_used_again() {
+        let mut stops = Stops::default();
+        let mut press =
+            |stops: &mut Stops, last| stops.press(origin(1), last, tid(1), LeaveReason::of("a test"));
+        assert_eq!((press(&mut stops, 0), press(&mut stops, 0)), (1, 2));
+        let mut fresh = Stops::default();
+        assert_eq!(press(&mut fresh, 2), 3);
+        stops.release(tid(1));
+        assert!(stops.merge(&entries(&fresh), &operators()).has_press && stops.is_open());
     }
 
     #[test]
