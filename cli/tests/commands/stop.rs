@@ -66,7 +66,9 @@ fn release_without_the_role_is_refused() {
     std::fs::write(&path, "[[rule]]\nfrom = ['*']\nto = ['*']\n").expect("the test's own directory");
     let section = format!("[security]\naccess = \"{}\"\n[lncl]", path.display());
     let _knee = scenario.start_changed("knee", 2, &[("[lncl]", &section)], &[]);
-    assert_eq!(scenario.sinew("knee", &["stop", "press"]).code, Some(0));
+    // It looks for others before it says that all have confirmed.
+    let answer = scenario.sinew("knee", &["stop", "press", "--within-ms", "20000"]);
+    assert_eq!(answer.code, Some(0), "{}{}", answer.out, answer.err);
     let answer = scenario.sinew("knee", &["stop", "release"]);
     assert!(answer.code == Some(1) && answer.out.contains("[roles]"), "{}{}", answer.out, answer.err);
     assert_eq!(scenario.sinew("knee", &["stop", "status"]).code, Some(1));

@@ -10,10 +10,15 @@ use sinew_runtime::{
 
 use super::{super::frame::Frame, Core, Peer};
 
+/// The note of a node in the hold at its start.
+const STARTING: &str = "it has just started, and looks for other nodes";
+
 impl Core {
-    /// Returns whether this node and all others that it knows have confirmed the stop.
+    /// Returns whether this node and all others that it knows have confirmed the stop. A node that has just started may
+    /// not know all.
     pub(in crate::stop) fn is_confirmed(&self) -> bool {
         self.latched == StopState::Stopped
+            && !self.is_new
             && self.safe_at.is_some()
             && self.peers.values().all(|peer| peer.confirmed_at.is_some())
     }
@@ -39,7 +44,7 @@ impl Core {
             node: self.own.node,
             name: self.own.name.clone(),
             state: Some(self.latched),
-            confirmed_us: self.since_stop(self.safe_at),
+            confirmed_us: self.since_stop(self.safe_at).filter(|_| !self.is_new),
             safe_us: self.since_stop(self.safe_at),
             outputs: self.outputs.outputs,
             bound_us: None,
@@ -59,6 +64,7 @@ impl Core {
             StopState::Stopped if self.safe_at.is_none() => {
                 "an output is not safe yet, or its safe function fails: see the log of this node".to_owned()
             }
+            StopState::Stopped if self.is_new => STARTING.to_owned(),
             StopState::Held => self.waits_for(),
             StopState::Stopped | StopState::Released => String::new(),
         }
@@ -75,7 +81,7 @@ impl Core {
             .take(8)
             .collect();
         if unknown.is_empty() {
-            return "it has just started, and looks for other nodes".to_owned();
+            return STARTING.to_owned();
         }
         format!("the state of the stop is not received from {}", unknown.join(", "))
     }

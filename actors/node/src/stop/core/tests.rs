@@ -166,6 +166,18 @@ fn press_is_repeated_until_it_is_confirmed() {
     assert!(core.next_wake() >= Some(at(3_000)), "it is refreshed, and not repeated");
 }
 
+#[test]
+fn node_that_starts_confirms_only_after_the_hold() {
+    let mut core = Core::new(own(1), Stops::default(), at(0));
+    press(&mut core, at(100));
+    core.handle(at(101), Input::OutputsSeen(StoppedOutputs::default(), 0));
+    let report = core.report();
+    assert!(!core.is_confirmed() && !report.is_confirmed(), "{report:?}");
+    assert!(report.nodes[0].note.contains("just started"), "{report:?}");
+    core.handle(at(1_000), Input::NodesSeen(Vec::new()));
+    assert!(core.is_confirmed() && core.report().is_confirmed());
+}
+
 // spec: STOP-5
 #[test]
 fn node_with_a_live_output_does_not_confirm() {
