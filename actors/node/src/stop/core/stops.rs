@@ -259,8 +259,7 @@ mod tests {
     #[test]
     fn number_of_a_forgotten_press_is_not_used_again() {
         let mut stops = Stops::default();
-        let mut press =
-            |stops: &mut Stops, last| stops.press(origin(1), last, tid(1), LeaveReason::of("a test"));
+        let press = |stops: &mut Stops, last| stops.press(origin(1), last, tid(1), LeaveReason::of("a test"));
         assert_eq!((press(&mut stops, 0), press(&mut stops, 0)), (1, 2));
         let mut fresh = Stops::default();
         assert_eq!(press(&mut fresh, 2), 3);
