@@ -11,7 +11,7 @@ use sinew::{
     message::{AskError, Rejection, Sender},
     prelude::*,
     protection::{ArmError, Cause, Guard, Protection, State},
-    stop::{AskStop, ReleaseStop, StopReport, StopState},
+    stop::{AskStop, PressStop, ReleaseStop, StopReport, StopState},
 };
 use sinew_testkit::{
     Loopback, TestDirectory, all_run,
@@ -253,6 +253,16 @@ fn release_by_one_that_is_no_operator_is_refused() {
     robot.node.handle().reload_access().expect("it has no faults");
     let report = release(&robot).expect("an answer");
     assert!(report.refused.is_none() && report.presses.is_empty(), "{report:?}");
+}
+
+#[test]
+fn press_that_asks_nothing_stops_too() {
+    let network = Loopback::new();
+    let robot = build(network.node("knee"), 0);
+    let order = PressStop { reason: "a button".to_owned(), within_ms: 0 };
+    let outcome = robot.sender.message(stop_of(&robot), &order).confirmed(WITHIN).expect("there is room");
+    assert_eq!(wait(outcome), Outcome::Delivered);
+    assert_eq!(status(&robot).state, StopState::Stopped);
 }
 
 #[test]

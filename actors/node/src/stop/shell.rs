@@ -206,10 +206,10 @@ impl Shell {
                 let is_taken = state.ctx.router.acknowledge_stop(source.app);
                 if is_taken { Ok(()) } else { Err(Rejection::ByHandler) }
             }
-            PressStop::KIND | ReleaseStop::KIND | AskStop::KIND if !message.header.flags.has(Flags::ASK) => {
+            PressStop::KIND => return self.press(state, now, message),
+            ReleaseStop::KIND | AskStop::KIND if !message.header.flags.has(Flags::ASK) => {
                 Err(Rejection::Unsupported)
             }
-            PressStop::KIND => return self.press(state, now, message),
             ReleaseStop::KIND => return self.release(state, now, message),
             AskStop::KIND => self.reply(state, &message, &self.core.report()),
             _ => Err(Rejection::UnknownKind),
@@ -234,12 +234,16 @@ impl Shell {
     }
 
     /// spec: STOP-9
-    fn press(&mut self, state: &Arc<NodeState>, now: Time, question: Message) {
+    fn press(&mut self, state: &Arc<NodeState>, now: Time, mut question: Message) {
         // A press that cannot be read is one, too.
         let order = question.decode::<PressStop>().unwrap_or_default();
         let reason = if order.reason.trim().is_empty() { "no reason given" } else { order.reason.trim() };
         let by = question.header.source;
         self.handle(state, now, Input::Pressed { by, reason: LeaveReason::of(reason) });
+        if !question.header.flags.has(Flags::ASK) {
+            // It stops, and nothing waits for the report.
+            return question.settle(Outcome::Delivered);
+        }
         self.wait(state, now, question, (order.within_ms, false));
     }
 
