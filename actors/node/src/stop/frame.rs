@@ -14,6 +14,9 @@ pub(super) const ENTRIES_MAX: usize = 128;
 pub(super) const SOURCES_MAX: usize = 64;
 /// Maximum bytes of a reason.
 const REASON_BYTES_MAX: usize = 200;
+/// Highest number of a press. Far above what a node counts in its life, and far below the end of the type: a wrong
+/// number of another node leaves room for later presses of its origin.
+const PRESSED_MAX: u32 = u32::MAX / 2;
 /// Maximum bytes of a frame: each origin with its numbers and a reason of 200 bytes.
 const BYTES_MAX: usize = 64 * 1024;
 
@@ -44,6 +47,13 @@ impl Entry {
     /// Returns whether a press is not released.
     pub(super) const fn is_open(&self) -> bool {
         self.pressed > self.released
+    }
+
+    /// Returns whether a node can have written it.
+    pub(super) fn is_legal(&self) -> bool {
+        (1..=PRESSED_MAX).contains(&self.pressed)
+            && self.released <= self.pressed
+            && self.reason.len() <= REASON_BYTES_MAX
     }
 }
 
@@ -82,16 +92,14 @@ impl Frame {
         }
         let frame: Self =
             decode(&message.payload).map_err(|error| format!("a state of the stop: {error}"))?;
-        let is_legal = |entry: &Entry| {
-            entry.pressed > 0 && entry.released <= entry.pressed && entry.reason.len() <= REASON_BYTES_MAX
-        };
         // One more than is kept: that of the sender itself.
         if frame.entries.len() > ENTRIES_MAX + 1 || frame.sources.len() > SOURCES_MAX {
             return Err("a state of the stop with too many entries".to_owned());
         }
-        if !frame.entries.iter().all(is_legal) {
+        if !frame.entries.iter().all(Entry::is_legal) {
             return Err(
-                "a state of the stop with a long reason, or that releases more than was pressed".to_owned()
+                "a state of the stop with a long reason, a number beyond its limit, or that releases more than was pressed"
+                    .to_owned(),
             );
         }
         Ok(frame)
@@ -128,14 +136,15 @@ mod tests {
 
     #[test]
     fn longest_frame_is_read() {
-        let message = message(vec![entry(u32::MAX, u32::MAX); ENTRIES_MAX + 1]);
+        let message = message(vec![entry(PRESSED_MAX, PRESSED_MAX); ENTRIES_MAX + 1]);
         assert!(message.payload.len() <= BYTES_MAX, "{}", message.payload.len());
         assert_eq!(Frame::of(&message).expect("it is legal").entries.len(), ENTRIES_MAX + 1);
     }
 
     #[test]
     fn illegal_frames_are_refused() {
-        for entries in [vec![entry(1, 2)], vec![entry(0, 0)], vec![entry(1, 0); ENTRIES_MAX + 2]] {
+        let illegal = [entry(1, 2), entry(0, 0), entry(PRESSED_MAX + 1, 0)].map(|entry| vec![entry]);
+        for entries in illegal.into_iter().chain([vec![entry(1, 0); ENTRIES_MAX + 2]]) {
             assert!(Frame::of(&message(entries)).is_err());
         }
         let header = Header::new(Kind::STOP_STATE, Tid::NONE, Tid::NONE);

@@ -92,8 +92,9 @@ fn read(path: &PathBuf) -> Result<Stops, String> {
         return Ok(Stops::default());
     };
     let content: Content = decode(&bytes).map_err(|error| error.to_string())?;
-    if content.entries.iter().any(|entry| entry.released > entry.pressed) {
-        return Err("it releases more than was pressed".to_owned());
+    // Other nodes refuse states with such entries: they would not learn of a press.
+    if !content.entries.iter().all(Entry::is_legal) {
+        return Err("it has an entry that no node writes".to_owned());
     }
     Ok(content.entries.into_iter().collect())
 }
