@@ -169,7 +169,11 @@ impl Core {
             Input::FrameReceived { from, frame, operators } => self.receive(now, from, frame, &operators),
             Input::NodesSeen(nodes) => self.see(now, nodes),
             Input::OutputsSeen(outputs, not_safe) => {
-                self.outputs = outputs;
+                if self.outputs != outputs {
+                    // Before the node may be lost: the others tell by it when its outputs are safe.
+                    self.outputs = outputs;
+                    self.peers.values_mut().for_each(|peer| peer.due = now);
+                }
                 // spec: STOP-5
                 if not_safe == 0 && self.stopped_at.is_some() && self.safe_at.is_none() {
                     self.safe_at = Some(now);

@@ -126,7 +126,8 @@ impl Core {
             let bound = last + Duration::from_micros(frame.watchdog_us);
             return (Some(bound), format!("{why}; its senders are stopped, and its watchdogs make it safe"));
         }
-        if let Some(on_lost) = frame.on_lost_us {
+        // One that is present may have lost nothing.
+        if let Some(on_lost) = frame.on_lost_us.filter(|_| peer.lost.is_some()) {
             let bound = Duration::from_micros(on_lost);
             return (Some(bound), format!("{why}; it stops by itself when it loses a node"));
         }

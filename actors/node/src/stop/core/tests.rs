@@ -213,6 +213,15 @@ fn watchdogs_bound_a_node_that_is_cut_off() {
     assert!(node.bound_us.is_none() && node.note.contains("stop.on_lost"), "{node:?}");
     let node = hear(&mut released(1), outputs_of(2), Some(Duration::from_secs(2)));
     assert_eq!(node.bound_us, Some(2_000_000), "{node:?}");
+    // That one is present, and may have lost nothing
+    let mut core = released(1);
+    let _ = hear(&mut core, outputs_of(2), Some(Duration::from_secs(2)));
+    core.handle(at(2_100), Input::NodesSeen(vec![seen(2, None)]));
+    let own = Own { on_lost: Some(Duration::from_secs(2)), ..own(2) };
+    let mut present = Core::new(own, Stops::default(), at(0));
+    present.handle(at(2_100), Input::OutputsSeen(outputs_of(2), 1));
+    exchange(at(2_101), &present, &mut core);
+    assert_eq!(core.report().nodes[1].bound_us, None, "{:?}", core.report());
     // It has no output
     let node = hear(&mut released(1), StoppedOutputs::default(), None);
     assert_eq!(node.bound_us, Some(0), "{node:?}");
@@ -221,6 +230,19 @@ fn watchdogs_bound_a_node_that_is_cut_off() {
     core.handle(at(1_600), Input::NodesSeen(vec![seen(2, Some("silent"))]));
     press(&mut core, at(2_000));
     assert!(core.report().nodes[1].note.contains("by hand"), "{:?}", core.report());
+}
+
+#[test]
+fn other_nodes_learn_of_new_outputs_at_once() {
+    let mut core = released(1);
+    exchange(at(1_500), &released(2), &mut core);
+    core.handle(at(1_501), Input::TimePassed);
+    orders(&mut core);
+    core.handle(at(1_502), Input::OutputsSeen(outputs_of(2), 0));
+    let sent = frames(orders(&mut core));
+    assert!(sent.len() == 1 && sent[0].1.outputs == 1, "{sent:?}");
+    core.handle(at(1_503), Input::OutputsSeen(outputs_of(2), 0));
+    assert_eq!(frames(orders(&mut core)), []);
 }
 
 // spec: STOP-3
