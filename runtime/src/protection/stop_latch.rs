@@ -19,6 +19,8 @@ const STATE_BITS: u32 = 2;
 const RELEASED: u64 = 0;
 const HELD: u64 = 1;
 const STOPPED: u64 = 2;
+/// Held from the start of the node on: nothing was released yet.
+const STARTING: u64 = 3;
 const STATE: u64 = (1 << STATE_BITS) - 1;
 
 /// The latch of one node's stop.
@@ -64,12 +66,17 @@ impl Latched {
         self.0 & STATE == STOPPED
     }
 
+    /// Returns whether the node is held since its start: outputs of other processes, too, must not be armed.
+    pub(crate) const fn is_starting(self) -> bool {
+        self.0 & STATE == STARTING
+    }
+
     /// Returns the state, for reports.
     #[must_use]
     pub const fn state(self) -> StopState {
         match self.0 & STATE {
             RELEASED => StopState::Released,
-            HELD => StopState::Held,
+            HELD | STARTING => StopState::Held,
             _ => StopState::Stopped,
         }
     }
@@ -105,12 +112,21 @@ impl StopLatch {
         seen.is_stopped() && self.word.compare_exchange(seen.0, released, ordering, failed).is_ok()
     }
 
+    /// Begins the hold at the start of a node. It ends as any other one.
+    pub fn begin(&self) {
+        let (ordering, failed) = (Ordering::SeqCst, Ordering::SeqCst);
+        // A press stays.
+        let _ = self.word.compare_exchange(RELEASED, STARTING, ordering, failed);
+    }
+
     /// Permits or forbids to arm outputs while no stop is in force. Outputs that are live stay so.
     pub fn hold(&self, is_held: bool) {
         let state = if is_held { HELD } else { RELEASED };
-        // A stop stays: only a release ends it.
+        // A stop stays: only a release ends it. The hold at the start is one already.
         let _ = self.word.fetch_update(Ordering::SeqCst, Ordering::SeqCst, |word| {
-            (!Latched(word).is_stopped()).then(|| Latched::of(Latched(word).presses(), state))
+            let now = Latched(word);
+            let stays = now.is_stopped() || is_held && now.is_starting();
+            (!stays).then(|| Latched::of(now.presses(), state))
         });
     }
 
@@ -173,6 +189,23 @@ mod tests {
         assert!(latch.read().is_released());
         latch.hold(true);
         assert!(!latch.read().is_released() && !latch.read().is_stopped());
+    }
+
+    #[test]
+    fn hold_at_the_start_ends_once() {
+        let latch = StopLatch::default();
+        latch.begin();
+        latch.hold(true);
+        assert!(latch.read().is_starting() && latch.read().state() == StopState::Held);
+        latch.hold(false);
+        latch.hold(true);
+        assert!(!latch.read().is_starting() && !latch.read().is_released());
+        // A press ends it, too
+        let pressed = StopLatch::default();
+        pressed.begin();
+        pressed.press();
+        pressed.begin();
+        assert!(pressed.release(pressed.read()) && !pressed.read().is_starting());
     }
 
     #[test]

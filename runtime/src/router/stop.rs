@@ -75,7 +75,8 @@ impl Router {
     }
 
     /// Returns whether the message is an echo that a stop cuts: every one while the node is stopped, and later those of
-    /// applications in other processes that have not acknowledged the stop. Without echoes the commands of every sender
+    /// applications in other processes that have not acknowledged the stop. In the hold at the node's start it cuts the
+    /// ones of all applications in other processes. Without echoes the commands of every sender
     /// become too old, also for outputs that do not read the latch.
     #[inline]
     pub(super) fn is_cut(&self, header: &Header) -> bool {
@@ -84,11 +85,14 @@ impl Router {
 
     fn is_echo_cut(&self, header: &Header) -> bool {
         let (now, source) = (self.stop.read(), header.source);
-        if now.is_stopped() || now.presses() == 0 || source.node != self.node || self.uplink.is_some() {
+        let is_free = now.presses() == 0 && !now.is_starting();
+        if now.is_stopped() || is_free || source.node != self.node || self.uplink.is_some() {
             return now.is_stopped();
         }
         let sources = self.echo_sources.load();
-        !sources.here.contains(&source.app) && sources.acknowledged.get(&source.app) != Some(&now.presses())
+        let has_acknowledged =
+            !now.is_starting() && sources.acknowledged.get(&source.app) == Some(&now.presses());
+        !sources.here.contains(&source.app) && !has_acknowledged
     }
 }
 
@@ -141,6 +145,11 @@ mod tests {
             router.send(Message::new(header, Bytes::new())).is_ok()
         };
         assert!(echo_of(own) && echo_of(other));
+        router.stop().begin();
+        assert!(echo_of(own) && !echo_of(other), "a node that starts does not know of a stop yet");
+        router.stop().hold(false);
+        router.stop().hold(true);
+        assert!(echo_of(own) && echo_of(other), "outputs that are live stay so in a later hold");
         for _ in 0..2 {
             router.press_stop();
             assert!(!echo_of(own) && !echo_of(other) && !router.acknowledge_stop(other));

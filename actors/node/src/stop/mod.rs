@@ -15,7 +15,7 @@
 //! | STOP-5 | A node says that it is safe when it is stopped and no output in its process is live or waits for its safe function. Such a STATE that has all presses of the reader is the confirmation. |
 //! | STOP-6 | A node that starts is held: no output can be armed until two cycles of NDL and a look at the known nodes have passed, and each present node has sent STATE to this incarnation. A node that finds another one is held until that has sent STATE. Outputs that are live stay so while a node is held. |
 //! | STOP-7 | With `node.state` the numbers outlive the node. A file that cannot be read is a press. |
-//! | STOP-8 | A stopped node hands over no echo. So the commands of its senders, and to its outputs in other processes, become too old within the limits of their types. After the release it hands over no echo of an application in another process before that has acknowledged the stop. |
+//! | STOP-8 | A stopped node hands over no echo. So the commands of its senders, and to its outputs in other processes, become too old within the limits of their types. In the hold at its start it hands over none of its applications in other processes. After the release it hands over no echo of an application in another process before that has acknowledged the stop. |
 //! | STOP-9 | Applications of the node's own user, and of other nodes, may press. Guests may not. Only an application of the node itself may release there. |
 //! | STOP-10 | With `stop.on_lost`, a node that loses another one without its farewell presses the stop. |
 //!

@@ -61,6 +61,7 @@ pub(crate) fn begin(state: &Arc<NodeState>) -> io::Result<()> {
     let (put, events) = sync_channel(WAITING_MAX);
     let mut shell = Shell::new(state, Time::now());
     // Before any application: it is held from its start.
+    state.ctx.router.stop().begin();
     shell.turn(state, Time::now(), None);
     let route = Arc::new(());
     let of = Of { state: Arc::downgrade(state), route: Arc::downgrade(&route) };
