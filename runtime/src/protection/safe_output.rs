@@ -111,10 +111,15 @@ impl WatchState {
 
     /// Counts the output as not safe, or as safe. The caller holds its lock.
     fn count(&self, is_not_safe: bool) {
-        match (self.is_counted.swap(is_not_safe, Ordering::SeqCst), is_not_safe) {
-            (false, true) => self.stop.count(),
-            (true, false) => self.stop.discount(),
-            (false, false) | (true, true) => {}
+        // SYNC: by that lock. So a decision that changes nothing costs a load, and no exchange.
+        if self.is_counted.load(Ordering::Relaxed) == is_not_safe {
+            return;
+        }
+        self.is_counted.store(is_not_safe, Ordering::Relaxed);
+        if is_not_safe {
+            self.stop.count();
+        } else {
+            self.stop.discount();
         }
     }
 
