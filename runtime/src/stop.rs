@@ -108,7 +108,8 @@ pub struct StopNode {
     /// Its state, as last received; `None`: nothing was received from this incarnation.
     pub state: Option<StopState>,
     /// Time from the newest press, as the reporting node learned of it, until the confirmation of this node was there,
-    /// in microseconds; `None`: it has not confirmed, or no stop is in force.
+    /// in microseconds; `None`: it has not confirmed, no stop is in force, or this is the reporting node and it has
+    /// just started: it may not know all others.
     pub confirmed_us: Option<u64>,
     /// Time that the node itself needed from its own knowledge of the press until its outputs were safe, in
     /// microseconds.
