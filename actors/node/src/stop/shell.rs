@@ -124,7 +124,7 @@ impl Shell {
         self.answer_waiting(state, now);
     }
 
-    /// Reads the known nodes, if that is due. It waits for no layer: while the discovery has its lock, it is tried again.
+    /// Reads the known nodes, if that is due. It waits for no layer: while the discovery has its lock, it tries again.
     fn read_nodes(&mut self, state: &Arc<NodeState>, now: Time) {
         if now < self.nodes_due {
             return;

@@ -99,10 +99,10 @@ impl Stops {
         })
     }
 
-    /// Makes room for an entry: forgets the released ones of the oldest incarnations, as far as there are as many as may
-    /// be. Returns `false` if there is none: all are open, or the new one is released and older itself. So nodes that
-    /// know different ones come to the same ones, and do not replace them again and again. A node that has missed the
-    /// release of a forgotten one stops the others again: that is the safe side.
+    /// Makes room for an entry: forgets the released ones of the oldest incarnations, as far as there are as many as
+    /// may be. Returns `false` if there is none: all are open, or the new one is released and older itself. So nodes
+    /// that know different ones come to the same ones, and do not replace them again and again. A node that has missed
+    /// the release of a forgotten one stops the others again: that is the safe side.
     fn make_room(&mut self, new: Origin, is_open: bool) -> bool {
         let age = |origin: Origin| (origin.incarnation, origin.node);
         while self.0.len() >= ENTRIES_MAX {
