@@ -15,6 +15,7 @@ mod reference;
 mod scenario;
 mod secured;
 mod send;
+mod stop;
 mod view;
 mod watch;
 mod why;

@@ -13,6 +13,7 @@ mod log_level;
 mod real_time;
 mod record;
 mod seeds;
+mod stop;
 #[cfg(test)]
 mod tests;
 mod time_policy;
@@ -41,6 +42,7 @@ pub use self::{
     log_level::LogLevel,
     real_time::RtConfig,
     record::{RecordCompression, RecordConfig},
+    stop::StopConfig,
     time_policy::TimePolicy,
     watch_group::WatchGroup,
 };
@@ -99,6 +101,8 @@ pub struct NodeConfig {
     pub record: RecordConfig,
     /// The measurement of the node's real-time behaviour.
     pub rt: RtConfig,
+    /// The stop of the whole system.
+    pub stop: StopConfig,
     /// The settings of applications: the tables `[app.NAME]` of its file, which [`NodeConfig::app`] reads.
     /// Default: none.
     pub app_settings: AppSettings,
@@ -425,6 +429,7 @@ impl NodeConfig {
             log: LogConfig::default(),
             record: RecordConfig::default(),
             rt: RtConfig::default(),
+            stop: StopConfig::default(),
             app_settings: AppSettings::default(),
         }
     }
