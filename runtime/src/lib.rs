@@ -44,6 +44,7 @@ pub mod monitor;
 pub mod name;
 mod observers;
 pub mod outcome;
+pub mod own_types;
 pub mod pending;
 pub mod protection;
 pub mod real_time;

@@ -30,5 +30,5 @@ pub use protection::Protection;
 pub use read::decode;
 pub use sinew_schema::SchemaHash;
 pub(crate) use type_names::{PLACES, remember};
-pub use type_names::{PayloadType, known_types, remember_own_types};
+pub use type_names::{PayloadType, known_types};
 pub use type_schema::{TypeSchema, schema_of};

@@ -10,10 +10,10 @@ use sinew_model::{
 };
 use sinew_record::{Channel, RecordReport, RecordedApp, RecordedType};
 use sinew_runtime::{
-    lock,
+    lock, own_types,
     tid::Tid,
     time::Time,
-    wire::{self, Kind, PayloadType, known_types},
+    wire::{Kind, PayloadType, known_types},
 };
 use sinew_shm::journal::{JournalReader, Start};
 
@@ -28,7 +28,7 @@ const READER_SCHEMA_BYTES_MAX: usize = 1 << 20;
 /// Records the payload types of Sinew that messages of applications have. A node that only receives them would not know
 /// their names.
 pub(super) fn remember_own_types() {
-    wire::remember_own_types();
+    own_types::remember_own_types();
     // A full table shows their IDs.
     let _ = PayloadType::of::<Ping>();
     let _ = (PayloadType::of::<ArriveAtBarrier>(), PayloadType::of::<LeaveBarrier>());
@@ -124,6 +124,7 @@ pub(crate) fn journal_kinds(path: &Path) -> Vec<Kind> {
 mod tests {
     use super::*;
     use sinew_record::{FrozenFacts, RECORDED_MAX};
+    use sinew_runtime::wire;
 
     #[test]
     fn facts_of_many_applications_can_be_read() {
