@@ -10,6 +10,7 @@ use sinew::{
     message::Rejection,
     stop::{AskStop, PressStop, ReleaseStop, StopNode, StopReport, StopState},
 };
+use sinew_view::StopAct;
 
 use crate::{
     Report,
@@ -19,6 +20,8 @@ use crate::{
 
 /// Time beyond the wait for confirmations in which the node answers.
 const ANSWER_MARGIN: Duration = Duration::from_millis(500);
+/// How long the page waits for the other nodes.
+const PAGE_WITHIN_MS: u32 = 1_000;
 
 /// The commands of `sinew stop`.
 #[derive(Debug, Subcommand)]
@@ -90,6 +93,30 @@ pub(crate) fn show(system: &mut System, order: &Order, is_wide: bool) -> Result<
         }
     };
     Ok(Report { text: text(&report, is_wide), json: in_json(&report), is_fine })
+}
+
+/// Carries out an act of the page.
+pub(crate) fn act(system: &mut System, act: StopAct) -> Result<StopReport, SystemError> {
+    match act {
+        StopAct::Ask => {
+            let within = system.within.as_millis().try_into().unwrap_or(u32::MAX);
+            ask(system, &AskStop {}, within)
+        }
+        StopAct::Press => {
+            let reason = "pressed on the page of sinew view".to_owned();
+            ask(system, &PressStop { reason, within_ms: PAGE_WITHIN_MS }, PAGE_WITHIN_MS)
+        }
+        StopAct::Release => ask(system, &ReleaseStop { within_ms: PAGE_WITHIN_MS }, PAGE_WITHIN_MS),
+    }
+}
+
+/// Returns the result of an act in one line.
+pub(crate) fn line(report: &Result<StopReport, SystemError>) -> String {
+    match report {
+        Ok(StopReport { refused: Some(why), .. }) => format!("refused: {}", clean(why)),
+        Ok(report) => format!("the node is {}", state(Some(report.state))),
+        Err(why) => clean(&why.to_string()),
+    }
 }
 
 /// Returns whether no node is stopped, as far as this one knows.
