@@ -12,6 +12,8 @@ use super::{ApiError, AsyncEndpoint, Endpoint};
 
 /// Time beyond the wait for confirmations in which the node answers.
 const ANSWER_MARGIN: Duration = Duration::from_millis(500);
+/// Longest wait for confirmations. A node waits no longer either.
+const WITHIN_MAX: Duration = Duration::from_secs(60);
 
 fn order(reason: &str, within: Duration) -> PressStop {
     let within_ms = u32::try_from(within.as_millis()).unwrap_or(u32::MAX);
@@ -22,7 +24,7 @@ impl Endpoint {
     /// Presses the stop of the whole system: every guarded output of every node becomes safe, and stays so until an
     /// operator has released the stop, and each application has acknowledged it and armed its output again.
     ///
-    /// Returns when all nodes have confirmed, and `within` this time at the latest. The report names the nodes that
+    /// Returns when all nodes have confirmed, and `within` this time at the latest, at most 60 s. The report names the nodes that
     /// have not. It is no safety function.
     ///
     /// # Errors
@@ -44,8 +46,8 @@ impl Endpoint {
     /// # Ok::<(), sinew::client::ApiError>(())
     /// ```
     pub fn press_stop(&mut self, reason: &str, within: Duration) -> Result<StopReport, ApiError> {
-        let stop = Tid::new(self.tid().node, AppAddress::STOP);
-        self.message(stop, &order(reason, within)).ask(within.saturating_add(ANSWER_MARGIN))
+        let (stop, within) = (Tid::new(self.tid().node, AppAddress::STOP), within.min(WITHIN_MAX));
+        self.message(stop, &order(reason, within)).ask(within + ANSWER_MARGIN)
     }
 
     /// Acknowledges a stop that is released: before that the outputs of this endpoint cannot be armed, as its node
@@ -66,8 +68,8 @@ impl AsyncEndpoint {
     /// # Errors
     /// The errors of [`Endpoint::press_stop`].
     pub async fn press_stop(&mut self, reason: &str, within: Duration) -> Result<StopReport, ApiError> {
-        let stop = Tid::new(self.tid().node, AppAddress::STOP);
-        self.message(stop, &order(reason, within)).ask(within.saturating_add(ANSWER_MARGIN)).await
+        let (stop, within) = (Tid::new(self.tid().node, AppAddress::STOP), within.min(WITHIN_MAX));
+        self.message(stop, &order(reason, within)).ask(within + ANSWER_MARGIN).await
     }
 
     /// Acknowledges a stop that is released, like [`Endpoint::acknowledge_stop`].

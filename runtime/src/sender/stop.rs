@@ -11,6 +11,8 @@ use crate::{
 
 /// Time beyond the wait for confirmations in which the own node answers.
 const ANSWER_MARGIN: Duration = Duration::from_millis(500);
+/// Longest wait for confirmations. A node waits no longer either.
+const WITHIN_MAX: Duration = Duration::from_secs(60);
 
 impl Sender {
     /// Returns the latch that the outputs of this application obey.
@@ -41,7 +43,7 @@ impl Sender {
     /// ([`Guard::acknowledge_stop`](crate::protection::Guard::acknowledge_stop)), and has armed the output again.
     ///
     /// The outputs in this process become safe at once, without a message. The reply comes when all nodes have
-    /// confirmed, and `within` this time at the latest. It names the nodes that have not. It is no safety function.
+    /// confirmed, and `within` this time at the latest, at most 60 s. It names the nodes that have not. It is no safety function.
     ///
     /// # Errors
     /// This node did not accept the order: its outputs in this process are stopped, and it tells the others within
@@ -67,6 +69,7 @@ impl Sender {
     /// ```
     pub fn press_stop(&self, reason: &str, within: Duration) -> Result<Reply<StopReport>, SendError> {
         self.shared.router.press_stop();
+        let within = within.min(WITHIN_MAX);
         let within_ms = u32::try_from(within.as_millis()).unwrap_or(u32::MAX);
         let order = PressStop { reason: reason.to_owned(), within_ms };
         let stop = Tid::new(self.shared.router.node(), AppAddress::STOP);
