@@ -105,7 +105,7 @@ fn node(node: &StopNode) -> Value {
 
 #[cfg(test)]
 mod tests {
-    use sinew::{Incarnation, Tid};
+    use sinew::{Tid, address::Incarnation};
 
     use super::*;
 
