@@ -7,8 +7,10 @@ const STALE_MS = 3000;
 const TRY_MS = 15000;
 /** A press without an answer is tried so often. */
 const TRIES = 3;
-/** A click after a press by the same pointer is not a further press. */
+/** A click so soon after the pointer went down is not a further press. */
 const SAME_MS = 2000;
+/** A state that comes so soon after an act may be older than it. */
+const LATE_MS = 2000;
 /** A second step within this time may be the same click; after the longer one it is a new decision. */
 const STEP_MS = [500, 10000];
 const KEY = "F9";
@@ -16,7 +18,8 @@ const KEY = "F9";
 let report = null;
 let fault = "";
 let heard = 0;
-let pressed = -Infinity;
+/** When the pointer went down on the button, until its click. */
+let pointed = -Infinity;
 let running = 0;
 /** When the latest act on this page ended. */
 let ended = 0;
@@ -52,8 +55,8 @@ export function update(data) {
   } else {
     take(data);
   }
-  // The result of an act on this page is of no use after another one elsewhere. A state may be as old as SAME_MS.
-  if (running === 0 && performance.now() - ended > SAME_MS && was !== isStoppedAnywhere()) result = null;
+  // The result of an act on this page is of no use after another one elsewhere. A state may be some time under way.
+  if (running === 0 && performance.now() - ended > LATE_MS && was !== isStoppedAnywhere()) result = null;
   draw();
 }
 
@@ -78,7 +81,6 @@ async function send(act) {
 }
 
 async function press() {
-  pressed = performance.now();
   step = null;
   result = { text: "pressed; waiting for the confirmations", isFine: false };
   running += 1;
@@ -130,10 +132,16 @@ async function release() {
 }
 
 // The press counts when the pointer goes down: a finger that slides away afterwards has pressed.
-button.addEventListener("pointerdown", (event) => event.button === 0 && press());
-button.addEventListener("click", () => {
-  // The keyboard and screen readers click without a pointer.
-  if (performance.now() - pressed > SAME_MS || running === 0 && result?.isFine === false) press();
+button.addEventListener("pointerdown", (event) => {
+  if (event.button !== 0) return;
+  pointed = performance.now();
+  press();
+});
+button.addEventListener("click", (event) => {
+  // The end of the press above. The keyboard and screen readers click without a pointer: that is a press of its own.
+  const isSame = event.detail > 0 && performance.now() - pointed < SAME_MS;
+  pointed = -Infinity;
+  if (!isSame) press();
 });
 document.addEventListener("keydown", (event) => {
   if (event.key !== KEY) return;
