@@ -24,8 +24,8 @@ impl Endpoint {
     /// Presses the stop of the whole system: every guarded output of every node becomes safe, and stays so until an
     /// operator has released the stop, and each application has acknowledged it and armed its output again.
     ///
-    /// Returns when all nodes have confirmed, and `within` this time at the latest, at most 60 s. The report names the nodes that
-    /// have not. It is no safety function.
+    /// Returns when all nodes have confirmed, and `within` this time at the latest, at most 60 s. The report names the
+    /// nodes that have not. It is no safety function.
     ///
     /// # Errors
     /// The node did not accept the order, or did not answer in time. In the latter case the stop may be pressed.

@@ -43,7 +43,8 @@ impl Sender {
     /// ([`Guard::acknowledge_stop`](crate::protection::Guard::acknowledge_stop)), and has armed the output again.
     ///
     /// The outputs in this process become safe at once, without a message. The reply comes when all nodes have
-    /// confirmed, and `within` this time at the latest, at most 60 s. It names the nodes that have not. It is no safety function.
+    /// confirmed, and `within` this time at the latest, at most 60 s. It names the nodes that have not. It is no safety
+    /// function.
     ///
     /// # Errors
     /// This node did not accept the order: its outputs in this process are stopped, and it tells the others within

@@ -72,8 +72,8 @@ pub struct NodeConfig {
     /// if that interface is chosen by its name.
     pub address: Option<NodeAddress>,
     /// Directory for the state that the node keeps from one start to the next: the addresses at which its peers
-    /// answered, kept parameters, and the presses of the stop; 1 to 4,096 bytes. It is created if only itself is missing, with mode 0700.
-    /// Nodes of one user may share one. Default: none, the node keeps nothing.
+    /// answered, kept parameters, and the presses of the stop; 1 to 4,096 bytes. It is created if only itself is
+    /// missing, with mode 0700. Nodes of one user may share one. Default: none, the node keeps nothing.
     pub state: Option<PathBuf>,
     /// Maximum number of messages in an application's mailbox, per class. 1 to 65,536; default 256.
     pub mailbox_capacity: usize,
