@@ -14,7 +14,7 @@ use crate::{
     message::{Endpoint, TidBits, nanos},
     registration::with,
     session::Session,
-    status::{CallError, Status},
+    status::Status,
     text::{self, Text},
 };
 
