@@ -26,7 +26,7 @@ pub const SINEW_STOP_NAME: usize = 64;
 const NODES_MAX: usize = 1_024;
 /// Longest wait for confirmations. A node waits no longer either.
 const WITHIN_MAX: Duration = Duration::from_secs(60);
-/// The reason of a press whose own one cannot be read.
+/// The reason of a press, if its own one cannot be read.
 const NO_REASON: &str = "the reason cannot be read";
 
 /// Whether a node is stopped.
@@ -227,7 +227,7 @@ mod tests {
     }
 
     #[test]
-    fn long_name_is_cut_between_characters_and_ends_with_a_zero() {
+    fn long_name_ends_with_a_whole_character_and_zero() {
         let written = StopNode::of(&node(&"\u{e4}".repeat(40))).name;
         let bytes = written.map(|byte| byte as u8);
         let name = CStr::from_bytes_until_nul(&bytes).expect("it ends with a zero");

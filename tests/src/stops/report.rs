@@ -84,7 +84,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn run_without_presses_or_with_a_violation_does_not_hold() {
+    fn run_with_a_violation_does_not_hold() {
         let mut report = Report::new(1);
         assert!(!report.holds());
         report.presses = 1;

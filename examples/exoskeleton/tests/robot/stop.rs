@@ -94,7 +94,7 @@ impl Robot {
         }
     }
 
-    /// The person at central, who also reads the statuses of the drives.
+    /// The person at central: it also reads the statuses of the drives.
     fn person(&self) -> Person {
         let mut endpoint = self.endpoint(&self.topology.central);
         endpoint.join(STATUS).expect("the node answers");
@@ -202,7 +202,7 @@ fn wait_until_kept(folder: &Path) {
 }
 
 #[test]
-fn stop_of_the_walking_robot_lasts_until_a_deliberate_reset() {
+fn stop_of_the_walking_robot_lasts_until_its_reset() {
     let _alone = alone();
     let folder = folder("stop");
     let mut robot = Robot::start(&folder);
