@@ -46,6 +46,7 @@ const isStoppedAnywhere = () => report !== null && (report.presses.length > 0 ||
 const shownPresses = () => JSON.stringify(report?.presses ?? []);
 const isStale = () => report === null || fault !== "" || performance.now() - heard > STALE_MS;
 const nameOf = (node) => node.name || node.node;
+const bound = (node) => (node.bound_ms === null ? "no time known" : `safe within ${node.bound_ms.toFixed(1)} ms of the press`);
 
 /** Takes the state that the stream brings. */
 export function update(data) {
@@ -88,7 +89,7 @@ async function press() {
   for (let left = TRIES; ; ) {
     try {
       take(await send("press"));
-      const open = report.nodes.filter((node) => node.confirmed_ms === null).map(nameOf);
+      const open = report.nodes.filter((node) => node.confirmed_ms === null).map((node) => `${nameOf(node)} (${bound(node)})`);
       result = open.length === 0
         ? { text: "pressed; all nodes have confirmed", isFine: true }
         : { text: `pressed; NOT confirmed by ${open.join(", ")}`, isFine: false };
@@ -173,13 +174,12 @@ function words() {
 
 function row(node) {
   const isConfirmed = node.confirmed_ms !== null;
-  const within = node.bound_ms === null ? "no time known" : `safe within ${node.bound_ms.toFixed(1)} ms of the press`;
   const levels = { stopped: isConfirmed ? "good" : "bad", held: "warn", released: isStoppedAnywhere() ? "bad" : "good", unknown: "bad" };
   return [
     nameOf(node), badge(node.state, levels[node.state]),
     isConfirmed ? `${node.confirmed_ms.toFixed(1)} ms` : isStoppedAnywhere() ? "NOT CONFIRMED" : "-",
     node.safe_ms === null ? "-" : `${node.safe_ms.toFixed(1)} ms`, `${node.outputs}`,
-    isConfirmed || !isStoppedAnywhere() ? node.note : `${within}: ${node.note}`,
+    isConfirmed || !isStoppedAnywhere() ? node.note : `${bound(node)}: ${node.note}`,
   ];
 }
 

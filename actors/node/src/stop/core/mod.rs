@@ -174,9 +174,9 @@ impl Core {
                     self.outputs = outputs;
                     self.peers.values_mut().for_each(|peer| peer.due = now);
                 }
-                // spec: STOP-5
-                if not_safe == 0 && self.stopped_at.is_some() && self.safe_at.is_none() {
-                    self.safe_at = Some(now);
+                // spec: STOP-5. An output that is made during the stop, and whose safe function fails, takes it back.
+                if self.stopped_at.is_some() && (not_safe == 0) != self.safe_at.is_some() {
+                    self.safe_at = (not_safe == 0).then_some(now);
                     self.note_change(now);
                 }
             }

@@ -193,6 +193,20 @@ fn node_with_a_live_output_does_not_confirm() {
     assert!(report.nodes[1].note.contains("not safe"), "{report:?}");
 }
 
+// spec: STOP-5
+#[test]
+fn output_that_fails_later_takes_the_confirmation_back() {
+    let mut core = released(1);
+    press(&mut core, at(2_000));
+    let mut see = |millis, not_safe| {
+        core.handle(at(millis), Input::OutputsSeen(StoppedOutputs::default(), not_safe));
+        core.is_confirmed()
+    };
+    assert!(see(2_001, 0));
+    assert!(!see(2_002, 1));
+    assert!(see(2_003, 0));
+}
+
 #[test]
 fn watchdogs_bound_a_node_that_is_cut_off() {
     let mut core = released(1);
