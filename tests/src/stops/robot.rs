@@ -42,8 +42,8 @@ pub(super) struct Output {
 pub(super) struct Robot {
     hosts: Hosts,
     directory: TestDirectory,
-    /// The arguments of all nodes: the group, the number of the project, and the load.
-    shared: [String; 3],
+    /// The arguments of all nodes: the group, the number of the project, the load, and the access list.
+    shared: [String; 4],
     nodes: Vec<NodeProcess>,
 }
 
@@ -83,8 +83,9 @@ impl Robot {
         let hosts = Hosts::new(NODES as u8)?;
         let directory = TestDirectory::new();
         let list = "[[rule]]\nfrom = ['*']\nto = ['*']\n[roles]\noperators = ['operator.*']\n";
-        directory.write("access.toml", list);
-        let shared = [own_group().to_string(), unique().to_string(), load.to_string()];
+        let access = directory.write("access.toml", list);
+        let access = access.display().to_string();
+        let shared = [own_group().to_string(), unique().to_string(), load.to_string(), access];
         let mut robot = Self { hosts, directory, shared, nodes: Vec::new() };
         robot.nodes = (0..NODES).map(|node| robot.process(node)).collect();
         robot.nodes.iter_mut().for_each(|node| drop(node.wait_for(&["up"])));
@@ -95,7 +96,6 @@ impl Robot {
         let host = &self.hosts.all()[node];
         let mut command = role("stop-node");
         command.arg(node.to_string()).arg(host.address.to_string()).args(&self.shared);
-        command.arg(self.directory.join("access.toml"));
         command.arg(self.directory.join(&format!("state-{node}")));
         let mut moved = host.moved(&command);
         // Each press is a warning.
