@@ -23,6 +23,7 @@
 //! | addresses | [`Tid`], [`address`] |
 //! | identities and keys | [`security`] |
 //! | protected commands and safe outputs | [`protection`] |
+//! | the stop of the whole system | [`stop`] |
 //! | counts of every message | [`audit`] |
 //! | reports for tools | [`inspect`] |
 //! | the structure of payload types | [`schema`] |
@@ -117,7 +118,7 @@ pub mod config {
     pub use sinew_model::config::{
         AppSettings, ConfigError, ConfigFault, Families, GnclConfig, Interface, InterfaceError, Interfaces,
         LnclConfig, LogConfig, LogLevel, NdlConfig, NodeConfig, RecordCompression, RecordConfig, RtConfig,
-        SecurityConfig, Seed, SeedError, SupervisionConfig, SyncConfig, TimePolicy, WatchGroup,
+        SecurityConfig, Seed, SeedError, StopConfig, SupervisionConfig, SyncConfig, TimePolicy, WatchGroup,
     };
 }
 
@@ -189,6 +190,15 @@ pub mod security {
         DiscoveryKey, Identity, Judged, MalformedCertificateError, PROTOCOL, Peer, PeerError, Sealer, Serial,
         Stamp, Tag, TimePolicy, Tls, UnixTime, Validity, ValidityError, Verdict, date, files, project_of,
         project_uri, rustls, words,
+    };
+}
+
+/// The stop of the whole system: every guarded output becomes safe, and the one that pressed learns which nodes
+/// confirmed. An application presses it by [`AppContext::press_stop`](crate::AppContext::press_stop), a client by
+/// [`Endpoint::press_stop`](crate::Endpoint::press_stop), a person by `sinew stop press`. It is no safety function.
+pub mod stop {
+    pub use sinew_runtime::stop::{
+        AcknowledgeStop, AskStop, PressStop, ReleaseStop, StopNode, StopPress, StopReport, StopState,
     };
 }
 

@@ -4,10 +4,11 @@ use std::{path::PathBuf, time::Duration};
 
 use clap::{CommandFactory as _, FromArgMatches as _, Parser, Subcommand};
 
-use crate::{bag, keys, logs, param, play, record, send, view, watch, why};
+use crate::{bag, keys, logs, param, play, record, send, stop, view, watch, why};
 
 /// Shows a running Sinew system, from any one node of it. It changes nothing, except that `send` and `play` send
-/// messages, `param` and the page of `view` set parameters, and `keys`, `record` and `bag` write files.
+/// messages, `param` and the page of `view` set parameters, `stop` stops the system, and `keys`, `record` and `bag`
+/// write files.
 ///
 /// It connects to the socket of a node on this machine (`lncl.socket` in the node's configuration) and asks
 /// that node, and through it all others.
@@ -199,6 +200,19 @@ pub(crate) enum Command {
   sinew param save walk.toml && sinew param load walk.toml"#
     )]
     Param(param::Order),
+    /// Presses the stop of the whole system, releases it, and shows which nodes have confirmed
+    ///
+    /// Every guarded output of every node becomes safe, and stays safe until an operator has released the stop and each
+    /// application has acknowledged it and armed its output again. A node that was away, or that is started anew, comes
+    /// up stopped. It is no safety function: a robot that a person wears has a switch that cuts the power.
+    #[command(
+        subcommand,
+        after_help = r#"Examples:
+  sinew stop press "the person stumbles"
+  sinew stop status
+  sinew stop release"#
+    )]
+    Stop(stop::Order),
     /// Reloads the access list and the deny list of the local node, without a restart
     ///
     /// A list with faults changes nothing: each is named with its line, and the list in force stays.

@@ -2,10 +2,11 @@
 //!
 //! It connects through a node's socket like any other program, and asks each node's inspection (`sinew::inspect`)
 //! through ordinary messages. It changes nothing, except that `send` sends messages, `reload` makes a node read
-//! its access list again, and `param` sets parameters of applications. `record` has the node record its messages,
-//! and writes them to a file. `play` sends them again, by a node of its own unless told otherwise. `keys` asks no
-//! node: it creates the files by which nodes authenticate each other. `bag` reads the files of recordings. `view`
-//! keeps asking all nodes, for programs that read their metrics, and `top` for its screen.
+//! its access list again, `param` sets parameters of applications, and `stop` presses and releases the stop. `record`
+//! has the node record its messages, and writes them to a file. `play` sends them again, by a node of its own unless
+//! told otherwise. `keys` asks no node: it creates the files by which nodes authenticate each other. `bag` reads the
+//! files of recordings. `view` keeps asking all nodes, for programs that read their metrics, and `top`
+//! for its screen.
 
 #![warn(clippy::print_stdout, clippy::print_stderr)] // `output` prints: the macros panic where a pipe is closed or a disk is full.
 
@@ -28,6 +29,7 @@ mod schema;
 mod security;
 mod send;
 mod sockets;
+mod stop;
 mod system;
 mod table;
 mod top;
@@ -142,6 +144,7 @@ fn run(arguments: &Arguments) -> Result<Report, SystemError> {
         Command::Audit => inside(&|system| audit::show(system, arguments.wide)),
         Command::Param(order) => inside(&|system| param::show(system, order, arguments.wide)),
         Command::Reload => inside(&reload::show),
+        Command::Stop(order) => inside(&|system| stop::show(system, order, arguments.wide)),
         Command::Doctor { rt: Some(length), .. } => Ok(doctor::show_real_time(*length, arguments.wide)),
         Command::Doctor { interface, rt: None } => Ok(doctor::show(interface.clone(), arguments)),
         Command::Keys(order) => keys::show(order, arguments.wide),

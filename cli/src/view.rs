@@ -21,13 +21,14 @@ use sinew::{
     Endpoint, NodeAddress, NodeApi, Tid, Time,
     inspect::{AskNode, NodeReport},
     parameters::{ParameterOutcome, SetParameters},
+    stop::StopReport,
 };
-use sinew_view::{AppParameters, NODES_MAX, NodeAnswers, Server, Snapshot, Source, Tap};
+use sinew_view::{AppParameters, NODES_MAX, NodeAnswers, Server, Snapshot, Source, StopAct, Tap};
 
 use crate::{
     Report,
     arguments::Arguments,
-    output, param, sockets,
+    output, param, sockets, stop,
     system::{REQUESTERS_MAX, System, SystemError, present, register},
     table::clean,
 };
@@ -130,6 +131,11 @@ impl Entry {
         system.leave();
         self.own().retain(|tid| !own.contains(tid));
     }
+
+    /// Disconnects without a wait for the node.
+    fn abandon(&self, system: System) {
+        self.own().retain(|tid| !system.own.contains(tid));
+    }
 }
 
 impl Source for Nodes {
@@ -157,6 +163,20 @@ impl Source for Nodes {
         self.entry.leave(system);
         output::note(format_args!("sinew: a set of the page: {}", text.trim_end()));
         outcome
+    }
+
+    fn stop(&self, act: StopAct) -> Result<StopReport, String> {
+        let mut system = self.entry.enter(self.within)?;
+        let report = stop::act(&mut system, act);
+        match &report {
+            Ok(_) => self.entry.leave(system),
+            // A node without an answer gives none to this either.
+            Err(_) => self.entry.abandon(system),
+        }
+        if act != StopAct::Ask {
+            output::note(format_args!("sinew: the stop, by the page: {act:?}: {}", stop::line(&report)));
+        }
+        report.map_err(|why| why.to_string())
     }
 
     fn tap(&self) -> Box<dyn Tap> {

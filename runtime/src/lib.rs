@@ -53,6 +53,7 @@ pub mod router;
 pub mod safe_wake;
 pub mod schedule;
 pub mod sender;
+pub mod stop;
 pub mod supervision;
 mod thread;
 pub mod tid;

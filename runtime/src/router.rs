@@ -10,6 +10,7 @@ pub mod mismatches;
 mod reach;
 mod retained;
 mod sink;
+mod stop;
 pub mod tap;
 #[cfg(test)]
 mod tests;
@@ -43,6 +44,7 @@ pub use self::{
 use crate::{
     clock::Clock,
     outcome::{Rejection, Ticket},
+    protection::StopLatch,
     tid::{AppAddress, NodeAddress, Tid},
     undelivered::{RefusalSink, is_noted},
     wire::{Flags, Header, Kind, Message},
@@ -116,6 +118,10 @@ pub struct Router {
     uplink: Option<Arc<dyn MessageSink>>,
     /// The latest values of groups for later members. Its lock is taken before `writing`.
     retained: Mutex<Retained>,
+    /// The stop that the outputs of this node's applications obey.
+    stop: Arc<StopLatch>,
+    /// The applications of which echoes are handed over after a stop.
+    echo_sources: ArcSwap<stop::EchoSources>,
     /// The clock of the applications that send with this table.
     clock: Clock,
 }
@@ -133,6 +139,8 @@ impl Router {
             group_sends: Arc::default(),
             uplink: None,
             retained: Mutex::default(),
+            stop: Arc::default(),
+            echo_sources: ArcSwap::default(),
             clock: Clock::WALL,
         }
     }
@@ -182,6 +190,9 @@ impl Router {
     pub fn send(&self, mut message: Message) -> Result<(), Rejection> {
         message.header.destination = self.absolute(message.header.destination);
         let destination = message.header.destination;
+        if self.is_cut(&message.header) {
+            return self.account(Err(SubmitError::new(message, Rejection::NotAllowed)));
+        }
         if let Some(uplink) = &self.uplink {
             return self.account(Self::send_up(&**uplink, message));
         }
@@ -238,7 +249,9 @@ impl Router {
     }
 
     fn deliver_by(&self, snapshot: &Snapshot, judge: Judge<'_>, message: Message) -> Result<(), Rejection> {
-        let result = if message.header.destination.is_single() {
+        let result = if self.is_cut(&message.header) {
+            Err(SubmitError::new(message, Rejection::NotAllowed))
+        } else if message.header.destination.is_single() {
             submit_here(&snapshot.table, judge, message)
         } else if message.header.flags.has(Flags::KEEP) {
             self.deliver_kept(judge, message)
@@ -269,6 +282,9 @@ impl Router {
     /// # Errors
     /// The message, and the reason of the rejection.
     pub fn offer(&self, message: Message, room: Option<&Waker>) -> Result<(), SubmitError> {
+        if self.is_cut(&message.header) {
+            return Err(SubmitError::new(message, Rejection::NotAllowed));
+        }
         let table = &self.snapshot.load().table;
         let Some(route) = table.local.get(&message.header.destination.app) else {
             return Err(SubmitError::new(message, Rejection::NoSuchApplication));

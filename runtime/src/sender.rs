@@ -8,6 +8,7 @@ mod expecting;
 mod groups;
 mod reply;
 mod sent_types;
+mod stop;
 mod unknown_name;
 
 use std::{

@@ -12,7 +12,7 @@
 //! | range | use |
 //! | --- | --- |
 //! | `0` | no application; never a destination |
-//! | `1..=15` | layers: LNCL 1, sync manager 2, GNCL 3, NDL 4; inspection 5 |
+//! | `1..=15` | layers: LNCL 1, sync manager 2, GNCL 3, NDL 4; inspection 5; stop 6 |
 //! | `16..=0x0fff` | reserved |
 //! | `0x1000..=0x7fff_ffff` | fixed: chosen by the user |
 //! | `0x8000_0000..=0xefff_ffff` | dynamic: assigned by LNCL |
@@ -142,6 +142,9 @@ impl AppAddress {
     pub const NDL: Self = Self(4);
     /// Answers queries about its node, for tools. It is not a layer, but has a static address like one.
     pub const INSPECT: Self = Self(5);
+    /// Presses, releases and reports the stop of the whole system. It is not a layer, but has a static address like
+    /// one.
+    pub const STOP: Self = Self(6);
     /// Every application of a node.
     pub const ALL: Self = Self(u32::MAX);
 
@@ -239,6 +242,7 @@ impl fmt::Display for AppAddress {
             Self::GNCL => f.write_str("gncl"),
             Self::NDL => f.write_str("ndl"),
             Self::INSPECT => f.write_str("inspect"),
+            Self::STOP => f.write_str("stop"),
             Self::ALL => f.write_str("*"),
             Self(bits) => write!(f, "{bits:x}"),
         }
@@ -261,6 +265,7 @@ impl FromStr for AppAddress {
             "gncl" => Ok(Self::GNCL),
             "ndl" => Ok(Self::NDL),
             "inspect" => Ok(Self::INSPECT),
+            "stop" => Ok(Self::STOP),
             "*" => Ok(Self::ALL),
             _ if text.starts_with('+') => Err(ParseTidError::Application(text.to_owned())),
             _ => u32::from_str_radix(text, 16)

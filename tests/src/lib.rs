@@ -10,6 +10,7 @@ pub mod orders;
 pub mod recording;
 pub mod roles;
 pub mod slow_consumer;
+pub mod stops;
 
 use std::{path::Path, process::Command};
 

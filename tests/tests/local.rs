@@ -7,3 +7,4 @@ mod faults;
 mod nodes;
 mod processes;
 mod recordings;
+mod stop;

@@ -108,9 +108,93 @@ async function takeScreenshots(page) {
     await page.waitForTimeout(300);
     const [wide, window] = await page.evaluate(() => [document.documentElement.scrollWidth, innerWidth]);
     check(`the tab ${tab} fits a phone`, wide <= window, `${wide} of ${window}`);
+    check(`the stop is visible on the tab ${tab} of a phone`, await isInWindow(page, "#stop-press"));
     await page.screenshot({ path: join(shots, `phone-${tab}.png`), fullPage: true });
   }
   await page.setViewportSize({ width: 1200, height: 900 });
+}
+
+/** Returns whether an element is wholly in the window, and nothing covers its middle. */
+const isInWindow = (page, selector) => page.evaluate((found) => {
+  scrollTo(0, document.documentElement.scrollHeight);
+  const element = document.querySelector(found);
+  const { left, right, top, bottom } = element.getBoundingClientRect();
+  const isInside = left >= 0 && top >= 0 && right <= innerWidth && bottom <= innerHeight;
+  const middle = document.elementFromPoint((left + right) / 2, (top + bottom) / 2);
+  scrollTo(0, 0);
+  return isInside && middle === element;
+}, selector);
+
+/** Waits until all nodes have confirmed the stop, and returns their rows. */
+async function confirmed(page, name) {
+  const all = (count) => {
+    const cells = [...document.querySelectorAll("#stop-nodes tbody tr")].map((row) => row.cells);
+    return cells.length === count && cells.every((row) => /^\d+\.\d ms$/.test(row[2].textContent)) && cells.map((row) => `${row[0].textContent} ${row[2].textContent}`);
+  };
+  const rows = await page.waitForFunction(all, NODES.length, { timeout: STEP_MS });
+  check(name, true, (await rows.jsonValue()).join(", "));
+}
+
+const stateIs = (page, text) => page.locator("#stop-state", { hasText: text }).waitFor({ timeout: STEP_MS });
+
+async function release(page) {
+  await page.locator("#stop-release").click();
+  // The second step at once counts as the same act.
+  await page.locator("#stop-release-confirm").evaluate((button) => button.click());
+  check("a release needs two steps", /^STOPPED/.test(await page.locator("#stop-state").textContent()));
+  await page.waitForTimeout(700);
+  await page.locator("#stop-release-confirm").click();
+  await page.locator("#stop-outcome", { hasText: "released; nothing moves by that" }).waitFor({ timeout: STEP_MS });
+  await stateIs(page, "running");
+  check("the release is shown", true);
+}
+
+/** Returns the states of all guarded outputs, as the tab System shows them. */
+const outputs = (page) => page.evaluate(() => document.querySelector("#outputs").textContent);
+
+async function stop(page, address) {
+  await page.locator("#tab-system").click();
+  await stateIs(page, "running");
+  await page.waitForFunction(() => document.querySelector("#outputs").textContent.includes("live"), null, { timeout: STEP_MS });
+  check("the stop is visible beside a long page", await isInWindow(page, "#stop-press"));
+  await page.locator("#stop-press").click();
+  await stateIs(page, "STOPPED by");
+  await confirmed(page, "a click stops the walking robot: four confirmations");
+  await page.waitForFunction(() => !document.querySelector("#outputs").textContent.includes("live"), null, { timeout: STEP_MS });
+  check("no output is live", true);
+  await page.screenshot({ path: join(shots, "stop.png"), fullPage: true });
+  await release(page);
+  await page.waitForTimeout(1_000);
+  check("no output is live after the release", !(await outputs(page)).includes("live"));
+  await stopElsewhere(page, address);
+  await page.locator("#tab-events").click();
+  await page.locator("#event-list tr", { hasText: "4 of 4 nodes have confirmed" }).first().waitFor({ timeout: STEP_MS });
+  check("the log of events has the press", true);
+}
+
+/** Presses on a phone by touch: the first page shows it. Then presses once more by the keyboard. */
+async function stopElsewhere(page, address) {
+  const phone = await browser.newContext({ hasTouch: true, viewport: { width: 390, height: 844 } });
+  const other = await phone.newPage();
+  await other.goto(address);
+  await stateIs(other, "running");
+  await other.locator("#stop-press").tap();
+  await confirmed(other, "a touch stops: four confirmations");
+  await other.screenshot({ path: join(shots, "phone-stop.png"), fullPage: true });
+  await phone.close();
+  await stateIs(page, "STOPPED by");
+  await confirmed(page, "a press elsewhere is shown");
+  const presses = () => page.locator("#stop-presses").textContent();
+  const before = await presses();
+  await page.locator("#stop-press").focus();
+  await page.keyboard.press("Enter");
+  await until("the press by Enter", async () => (await presses()) !== before);
+  const second = await presses();
+  await page.locator("#theme").focus();
+  await page.keyboard.press("F9");
+  await until("the press by the key", async () => (await presses()) !== second);
+  check("the keyboard presses", true, await presses());
+  await release(page);
 }
 
 async function useKeyboard(page) {
@@ -175,6 +259,8 @@ async function attack(address) {
   const evil = "http://evil.example";
   const post = (headers, body = '{"app":"knee.drive","undo":true}') =>
     status(address, "/api/parameters", { method: "POST", body, headers: { "content-type": "application/json", ...headers } });
+  const press = (headers, body = '{"act":"press"}') =>
+    status(address, "/api/stop", { method: "POST", body, headers: { "content-type": "application/json", ...headers } });
   const get = (path, headers = {}) => status(address, path, { headers });
   const cases = [
     ["no token", 401, get("/")],
@@ -182,6 +268,9 @@ async function attack(address) {
     ["a stream without the token", 401, get("/api/stream")],
     ["a write without the token", 401, post({ origin })],
     ["another host", 403, get("/metrics", { host: "evil.example" })],
+    ["a press without the token", 401, press({ origin })],
+    ["a press of another origin", 403, press({ cookie, origin: evil })],
+    ["a press of no known act", 400, press({ cookie, origin }, '{"act":"pause"}')],
     ["a write of another origin", 403, post({ cookie, origin: evil })],
     ["a write without an origin", 403, post({ cookie })],
     ["a stream of another origin", 403, get("/api/stream", { cookie, origin: evil })],
@@ -249,6 +338,7 @@ try {
   await plot(page);
   await setParameter(page);
   await attack(address);
+  await stop(page, address);
   if (minutes > 0) await stayOpen(page);
   await killKnee(page);
   check("no errors in the console", errors.length === 0, errors.join("; "));

@@ -5,6 +5,7 @@ import { drawOutcomes, drawSystem } from "./tables.js";
 import * as plots from "./plots.js";
 import * as parameters from "./parameters.js";
 import * as events from "./events.js";
+import * as stop from "./stop.js";
 
 /** Time without a state after which the page says that it is old. */
 const STALE_MS = 3000;
@@ -88,6 +89,7 @@ function open() {
     draw();
     drawConnection();
   });
+  on("stop", stop.update);
   on("log", events.add);
   on("points", plots.addPoints);
   on("messages", plots.showMessages);

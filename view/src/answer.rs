@@ -35,6 +35,7 @@ use crate::{
     pages::{Pages, wall_s},
     request::{self, Access, Document, Head, RequestError},
     source::Source,
+    stop::{self, StopAct},
     stream::{self, Line, States},
 };
 
@@ -48,6 +49,8 @@ const BODY_BYTES_MAX: usize = 16 * 1_024;
 const VALUES_MAX: usize = 64;
 /// Questions to applications at a time. Further ones wait.
 const QUESTIONS_MAX: usize = 2;
+/// Presses and releases of the stop at a time. They wait for no question.
+const STOP_ACTS_MAX: usize = 8;
 
 /// The parts that all connections share.
 pub(crate) struct Shared {
@@ -58,13 +61,28 @@ pub(crate) struct Shared {
     listed: Listed,
     log: Mutex<EventLog>,
     questions: Arc<Semaphore>,
+    /// The state of the stop.
+    stop: Listed,
+    /// One question for that state at a time.
+    stop_questions: Arc<Semaphore>,
+    stop_acts: Arc<Semaphore>,
 }
 
 impl Shared {
     pub(crate) fn new(source: Arc<dyn Source>, cache: Cache, pages: Pages, log: EventLog) -> Self {
-        let questions = Arc::new(Semaphore::new(QUESTIONS_MAX));
-        let (states, listed) = (States::default(), Listed::default());
-        Self { source, cache, pages, states, listed, log: Mutex::new(log), questions }
+        let slots = |count| Arc::new(Semaphore::new(count));
+        Self {
+            source,
+            cache,
+            pages,
+            states: States::default(),
+            listed: Listed::default(),
+            log: Mutex::new(log),
+            questions: slots(QUESTIONS_MAX),
+            stop: Listed::default(),
+            stop_questions: slots(1),
+            stop_acts: slots(STOP_ACTS_MAX),
+        }
     }
 
     pub(crate) fn log(&self) -> MutexGuard<'_, EventLog> {
@@ -160,6 +178,7 @@ pub(crate) async fn answer(
         },
         Ok(Document::Parameters) => parameters(shared).await,
         Ok(Document::Set) => set(shared, body).await,
+        Ok(Document::Stop) => act_on_stop(shared, body).await,
     }
 }
 
@@ -178,7 +197,7 @@ async fn metrics(shared: &Shared, format: Format) -> Response<Content> {
 
 async fn parameters(shared: &Arc<Shared>) -> Response<Content> {
     let ask = || async {
-        let apps = asked(shared, |source| source.parameters()).await.flatten()?;
+        let apps = asked(shared, &shared.questions, |source| source.parameters()).await.flatten()?;
         Ok::<_, String>(model::parameters(&apps))
     };
     let late = || Err(format!("the nodes gave no answer within {ASKED_WITHIN:?}; try again"));
@@ -188,14 +207,54 @@ async fn parameters(shared: &Arc<Shared>) -> Response<Content> {
     }
 }
 
+/// Presses or releases the stop. The act is recorded in the log of events and on the terminal.
+async fn act_on_stop(shared: &Arc<Shared>, body: Incoming) -> Response<Content> {
+    let body = match whole(body).await {
+        Ok(body) => body,
+        Err(why) => return json(StatusCode::PAYLOAD_TOO_LARGE, &json!({ "fault": why })),
+    };
+    let act = match StopAct::read(&body) {
+        Ok(act) => act,
+        Err(why) => return json(StatusCode::BAD_REQUEST, &json!({ "fault": why })),
+    };
+    let of = Arc::clone(shared);
+    let acted = asked(shared, &shared.stop_acts, move |source| {
+        let report = source.stop(act);
+        of.stop.forget();
+        let (text, is_fine) = act.sentence(&report);
+        of.log().write((wall_s() * 1e3) as u64, "stop", text, is_fine);
+        report
+    });
+    match acted.await.flatten() {
+        Ok(report) => json(StatusCode::OK, &json!({ "report": stop::json(&report) })),
+        Err(why) => json(StatusCode::CONFLICT, &json!({ "fault": why })),
+    }
+}
+
+/// Returns the state of the stop, or why it is not known, as JSON.
+pub(crate) async fn stop_state(shared: &Arc<Shared>) -> serde_json::Value {
+    let ask = || async {
+        let asked = asked(shared, &shared.stop_questions, |source| source.stop(StopAct::Ask));
+        Ok::<_, String>(stop::json(&asked.await.flatten()?))
+    };
+    shared.stop.get(PAGE_FRESH, ask).await.unwrap_or_else(|why| json!({ "fault": why }))
+}
+
+/// Reads a body to its end.
+async fn whole(body: Incoming) -> Result<Bytes, String> {
+    match timeout(ANSWER_WITHIN, Limited::new(body, BODY_BYTES_MAX).collect()).await {
+        Ok(Ok(body)) => Ok(body.to_bytes()),
+        Ok(Err(_)) | Err(_) => {
+            Err(format!("the body has to arrive whole, with at most {BODY_BYTES_MAX} bytes"))
+        }
+    }
+}
+
 /// Sets parameters. The set is recorded in the log of events and on the terminal.
 async fn set(shared: &Arc<Shared>, body: Incoming) -> Response<Content> {
-    let body = match timeout(ANSWER_WITHIN, Limited::new(body, BODY_BYTES_MAX).collect()).await {
-        Ok(Ok(body)) => body.to_bytes(),
-        Ok(Err(_)) | Err(_) => {
-            let why = format!("the body has to arrive whole, with at most {BODY_BYTES_MAX} bytes");
-            return json(StatusCode::PAYLOAD_TOO_LARGE, &json!({ "fault": why }));
-        }
+    let body = match whole(body).await {
+        Ok(body) => body,
+        Err(why) => return json(StatusCode::PAYLOAD_TOO_LARGE, &json!({ "fault": why })),
     };
     let (app, order) = match Order::read(&body) {
         Ok(order) => order,
@@ -210,7 +269,7 @@ async fn set(shared: &Arc<Shared>, body: Incoming) -> Response<Content> {
 /// Sets parameters. Its outcome is logged where it is known: the page may have closed its connection meanwhile.
 async fn apply(shared: &Arc<Shared>, app: String, order: SetParameters) -> Result<ParameterOutcome, String> {
     let of = Arc::clone(shared);
-    let outcome = asked(shared, move |source| {
+    let outcome = asked(shared, &shared.questions, move |source| {
         let outcome = source.set(&app, &order);
         of.listed.forget();
         of.record(&app, &order, &outcome);
@@ -240,13 +299,14 @@ fn sentence(order: &SetParameters, outcome: &Result<ParameterOutcome, String>) -
     }
 }
 
-/// Asks the system on a thread of its own: few at a time, since each asks all nodes.
+/// Asks the system on a thread of its own: as many at a time as there are slots.
 async fn asked<R: Send + 'static>(
     shared: &Arc<Shared>,
+    slots: &Arc<Semaphore>,
     ask: impl FnOnce(&dyn Source) -> R + Send + 'static,
 ) -> Result<R, String> {
     let work = async {
-        let slot = Arc::clone(&shared.questions).acquire_owned().await.map_err(|_| "it ends".to_owned())?;
+        let slot = Arc::clone(slots).acquire_owned().await.map_err(|_| "it ends".to_owned())?;
         let source = Arc::clone(&shared.source);
         let asked = spawn_blocking(move || {
             let _slot = slot;
@@ -254,7 +314,7 @@ async fn asked<R: Send + 'static>(
         });
         asked.await.map_err(|why| format!("sinew view failed while it asked: {why}; report this"))
     };
-    let late = format!("no answer within {ASKED_WITHIN:?}; look at the list, the values may have been set");
+    let late = format!("no answer within {ASKED_WITHIN:?}; it may be done: look at the present state");
     timeout(ASKED_WITHIN, work).await.map_err(|_| late)?
 }
 

@@ -18,7 +18,7 @@ macro_rules! asset {
     };
 }
 
-static ASSETS: [Asset; 13] = [
+static ASSETS: [Asset; 14] = [
     asset!("/", HTML, "index.html"),
     asset!("/page.css", STYLE, "page.css"),
     asset!("/main.js", SCRIPT, "main.js"),
@@ -29,6 +29,7 @@ static ASSETS: [Asset; 13] = [
     asset!("/plots.js", SCRIPT, "plots.js"),
     asset!("/parameters.js", SCRIPT, "parameters.js"),
     asset!("/events.js", SCRIPT, "events.js"),
+    asset!("/stop.js", SCRIPT, "stop.js"),
     asset!("/icon.svg", "image/svg+xml", "icon.svg"),
     asset!("/uPlot.js", SCRIPT, "uplot/uPlot.iife.min.js"),
     asset!("/uPlot.css", STYLE, "uplot/uPlot.min.css"),

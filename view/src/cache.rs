@@ -98,10 +98,16 @@ pub(crate) fn panic_text(panic: &(dyn Any + Send)) -> String {
 mod tests {
     use std::sync::atomic::{AtomicUsize, Ordering};
 
-    use sinew::parameters::{ParameterOutcome, SetParameters};
+    use sinew::{
+        parameters::{ParameterOutcome, SetParameters},
+        stop::StopReport,
+    };
 
     use super::*;
-    use crate::source::{AppParameters, NoSystem, Tap};
+    use crate::{
+        source::{AppParameters, NoSystem, Tap},
+        stop::StopAct,
+    };
 
     const HOUR: Duration = Duration::from_secs(3_600);
 
@@ -123,6 +129,10 @@ mod tests {
 
         fn set(&self, app: &str, set: &SetParameters) -> Result<ParameterOutcome, String> {
             NoSystem.set(app, set)
+        }
+
+        fn stop(&self, act: StopAct) -> Result<StopReport, String> {
+            NoSystem.stop(act)
         }
 
         fn tap(&self) -> Box<dyn Tap> {

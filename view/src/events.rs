@@ -3,12 +3,13 @@
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
 use serde::Serialize;
-use sinew::{NodeAddress, address::Incarnation, inspect::Missing};
+use sinew::{NodeAddress, address::Incarnation, inspect::Missing, stop::StopState};
 
 use crate::{
     nodes::{NodeLabels, State, bounded, rows},
     snapshot::{Answers, Snapshot},
     source::name_or_tid,
+    stop,
 };
 
 /// Events that are kept. Older ones are dropped.
@@ -27,7 +28,7 @@ pub(crate) struct Event {
     pub(crate) number: u64,
     /// When it was seen, in milliseconds of the wall clock.
     pub(crate) wall_ms: u64,
-    /// `node`, `application`, `barrier`, `output`, `link`, `log` or `write`.
+    /// `node`, `stop`, `application`, `barrier`, `output`, `link`, `log` or `write`.
     pub(crate) topic: &'static str,
     /// The part of the system that it is about.
     pub(crate) subject: String,
@@ -160,6 +161,10 @@ fn facts(snapshot: &Snapshot) -> Facts {
     }
     for answers in snapshot.answers() {
         let label = labels.get(answers.node.node);
+        if let Some(state) = answers.node.stop {
+            let text = format!("is {}", stop::word(state));
+            add("stop", label.clone(), answers.node.node, text, state == StopState::Released);
+        }
         add_apps(&mut add, answers, snapshot);
         add_barriers(&mut add, answers, &label);
         add_outputs(&mut add, answers);
@@ -289,6 +294,20 @@ mod tests {
         // A node that was started anew numbers its lines from 1.
         log.observe(&with(&[1], 2), 6);
         assert_eq!(texts(&log, 1), ["log hip: warn sinew::gncl: text 1"]);
+    }
+
+    #[test]
+    fn stop_that_is_pressed_elsewhere_is_an_event() {
+        let mut log = EventLog::default();
+        let with = |state| {
+            let mut all = snapshot();
+            let Ok(hip) = &mut all.nodes[0].result else { panic!("it has answered") };
+            hip.node.stop = Some(state);
+            all
+        };
+        log.observe(&with(StopState::Released), 1);
+        log.observe(&with(StopState::Stopped), 2);
+        assert_eq!(texts(&log, 0), ["stop hip: is stopped"]);
     }
 
     #[test]

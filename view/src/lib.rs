@@ -8,6 +8,7 @@
 //! browser ── GET /api/stream ──► stream: state, log ◄── cache ◄── thread `snapshots` ──► Source::snapshot
 //!                                   ▲ points, tables ◄── pages ◄── thread `messages` ──► Tap::poll
 //!         ── POST /api/parameters ──► answer ──► Source::set
+//!         ── POST /api/stop ────────► answer ──► Source::stop
 //! ```
 //!
 //! | module | content |
@@ -18,6 +19,7 @@
 //! | `metrics` | the table of all metrics, and their samples from a snapshot |
 //! | `model` | the state of the system as JSON |
 //! | `events` | the log of events: the differences of snapshots |
+//! | `stop` | the stop of the whole system on the page |
 //! | `look`, `scope` | the messages at which one page looks |
 //! | `fields`, `decimate` | the numbers of a payload, and series with few points |
 //! | `pages`, `stream` | the open pages, and the stream of each |
@@ -46,9 +48,11 @@ mod scope;
 mod server;
 mod snapshot;
 mod source;
+mod stop;
 mod stream;
 
 pub use metrics::{METRICS, Metric, Shape};
 pub use server::Server;
 pub use snapshot::{Answers, NODES_MAX, NodeAnswers, Snapshot};
 pub use source::{AppParameters, NoSystem, Sighting, Source, Tap};
+pub use stop::StopAct;

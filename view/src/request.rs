@@ -54,6 +54,8 @@ pub(crate) enum Document {
     Parameters,
     /// A set of parameters: the body has it.
     Set,
+    /// A press or a release of the stop: the body has it.
+    Stop,
 }
 
 /// Why a request is refused.
@@ -118,7 +120,7 @@ pub(crate) fn document(head: Head<'_>, access: Access<'_>) -> Result<Document, R
         return Err(RequestError::NoToken);
     }
     // A request that asks the nodes comes from the page alone. Browsers send no `Origin` with most that only read.
-    let writes = path == "/api/parameters" && *head.method == Method::POST;
+    let writes = matches!(path, "/api/parameters" | "/api/stop") && *head.method == Method::POST;
     if path.starts_with("/api/") {
         check_site(head.headers, &host, writes)?;
     }
@@ -128,12 +130,13 @@ pub(crate) fn document(head: Head<'_>, access: Access<'_>) -> Result<Document, R
             let query = head.uri.query().unwrap_or_default();
             Look::of_query(query).map(Document::Stream).ok_or(RequestError::Query)
         }
-        "/api/parameters" if writes => {
+        _ if writes => {
             if head.headers.get(CONTENT_TYPE).is_none_or(|found| found != "application/json") {
                 return Err(RequestError::NoJson);
             }
-            Ok(Document::Set)
+            Ok(if path == "/api/stop" { Document::Stop } else { Document::Set })
         }
+        "/api/stop" => Err(RequestError::Method("POST")),
         "/api/parameters" if *head.method != Method::GET => Err(RequestError::Method("GET, POST")),
         "/api/parameters" => {
             check_get(head)?;

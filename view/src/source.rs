@@ -5,9 +5,10 @@ use std::{collections::BTreeSet, time::Duration};
 use sinew::{
     Tid, Time,
     parameters::{ParameterList, ParameterOutcome, SetParameters},
+    stop::StopReport,
 };
 
-use crate::snapshot::Snapshot;
+use crate::{snapshot::Snapshot, stop::StopAct};
 
 /// Asks all nodes. Each call has a time limit of its own.
 ///
@@ -35,6 +36,13 @@ pub trait Source: Send + Sync + 'static {
     /// # Errors
     /// Why there is no outcome, with the remedy.
     fn set(&self, app: &str, set: &SetParameters) -> Result<ParameterOutcome, String>;
+
+    /// Presses or releases the stop of the whole system, or asks for its state. A press returns when all nodes have
+    /// confirmed, or after a second. The entry node decides whether this program may release.
+    ///
+    /// # Errors
+    /// Why there is no report, with the remedy. The stop may be pressed nevertheless.
+    fn stop(&self, act: StopAct) -> Result<StopReport, String>;
 
     /// Returns a reader of messages. It begins at the first call of [`Tap::poll`], and ends when it is dropped.
     fn tap(&self) -> Box<dyn Tap>;
@@ -105,6 +113,10 @@ impl Source for NoSystem {
 
     fn set(&self, app: &str, _: &SetParameters) -> Result<ParameterOutcome, String> {
         Err(format!("there is no application {app}; start a node"))
+    }
+
+    fn stop(&self, _: StopAct) -> Result<StopReport, String> {
+        Err("there is no node; start one".to_owned())
     }
 
     fn tap(&self) -> Box<dyn Tap> {

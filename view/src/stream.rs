@@ -18,7 +18,13 @@ use tokio::{
 };
 
 use crate::{
-    answer::Shared, body::event, cache::PAGE_FRESH, events::EventLog, look::Look, model, pages::wall_s,
+    answer::{Shared, stop_state},
+    body::event,
+    cache::PAGE_FRESH,
+    events::EventLog,
+    look::Look,
+    model,
+    pages::wall_s,
     snapshot::Snapshot,
 };
 
@@ -77,6 +83,7 @@ pub(crate) fn open(shared: &Arc<Shared>, line: &Arc<Line>, look: Look) -> Option
         // A page that has gone ends it at once, also while the nodes are asked.
         let end = tokio::select! {
             end = send_states(&shared, &events) => end,
+            end = send_stops(&shared, &events) => end,
             () = events.closed() => End::Closed,
         };
         drop(guard);
@@ -107,13 +114,31 @@ async fn send_states(shared: &Shared, events: &Sender<Bytes>) -> End {
             parts.push(event("log", &serde_json::json!(new)));
         }
         for part in parts {
-            match timeout(STUCK_WITHIN, events.send(part)).await {
-                Ok(Ok(())) => {}
-                Ok(Err(_)) => return End::Closed,
-                Err(_) => return End::Stuck,
+            if let Some(end) = send(events, part).await {
+                return end;
             }
         }
         sleep(PAGE_FRESH).await;
+    }
+}
+
+/// Sends the state of the stop, on a path of its own: a node without an answer delays the state of the system.
+async fn send_stops(shared: &Arc<Shared>, events: &Sender<Bytes>) -> End {
+    loop {
+        let part = event("stop", &stop_state(shared).await);
+        if let Some(end) = send(events, part).await {
+            return end;
+        }
+        sleep(PAGE_FRESH).await;
+    }
+}
+
+/// Sends an event to the page. Returns how the stream ended, if it did.
+async fn send(events: &Sender<Bytes>, part: Bytes) -> Option<End> {
+    match timeout(STUCK_WITHIN, events.send(part)).await {
+        Ok(Ok(())) => None,
+        Ok(Err(_)) => Some(End::Closed),
+        Err(_) => Some(End::Stuck),
     }
 }
 

@@ -14,7 +14,8 @@ use super::Registration;
 /// | `Never` | no | never |
 ///
 /// An endpoint has 64 links at most, 16 if they are automatic: with more frequent peers than that, all of them are
-/// reached through the node, which is quicker then. Messages to further peers go through the node, too.
+/// reached through the node, which is quicker then. Messages to further peers go through the node, too. An endpoint
+/// that guards an output makes no automatic link from then on.
 ///
 /// # Examples
 ///

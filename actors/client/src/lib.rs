@@ -193,6 +193,7 @@ mod requests;
 #[doc(hidden)]
 pub mod routes;
 mod stall_timeout;
+mod stop;
 #[cfg(test)]
 mod tests;
 mod undelivered;

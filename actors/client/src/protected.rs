@@ -22,6 +22,9 @@ impl Endpoint {
     /// Without echoes each message counts as too old. An endpoint that reconnects with another address
     /// creates its guards anew: messages sealed for the former address are refused.
     ///
+    /// From now on the endpoint makes no automatic direct link: the stop of the whole system reaches its outputs
+    /// through the node. With [`DirectLinks::Always`](crate::DirectLinks::Always) it does not reach them.
+    ///
     /// # Examples
     ///
     /// ```
@@ -80,6 +83,7 @@ impl Endpoint {
         safe: impl FnMut(&mut O, Cause) + Send + 'static,
     ) -> io::Result<Guard<O>> {
         let ends = (self.absolute(source), self.tid);
+        self.direct.keep_to_node();
         self.ends.guard::<P, O>(ends, Time::now(), output, safe)
     }
 

@@ -98,6 +98,13 @@ impl Routes {
         Self { own, direct_links, peers: BTreeMap::new(), links: 0 }
     }
 
+    /// From now on no link is made automatically: a stop cuts the echoes of this endpoint's outputs at the node.
+    pub const fn keep_to_node(&mut self) {
+        if matches!(self.direct_links, DirectLinks::Automatic) {
+            self.direct_links = DirectLinks::Never;
+        }
+    }
+
     /// Returns the path to `destination`, which is absolute.
     pub fn route(&self, destination: Tid, now: Time) -> Route {
         match self.peers.get(&destination) {

@@ -58,7 +58,8 @@ impl GuestQuotas {
     /// # Errors
     /// The rejected message: `QueueFull` if the quota of the guest, or of all guests, is used up. Messages that layers
     /// accept from no one are rejected, too, since they would bypass the quota. These are messages to a remote sync
-    /// manager (`ForgedSource`, as that one would report), and to a layer of all nodes (`Unsupported`).
+    /// manager (`ForgedSource`, as that one would report), and to a layer of all nodes (`Unsupported`). Guests neither
+    /// press nor read the stop (`NotAllowed`).
     pub fn admit(&self, here: NodeAddress, uid: u32, mut message: Message) -> Result<Message, SubmitError> {
         let Tid { node, app } = message.header.destination;
         if !app.is_layer() {
@@ -78,6 +79,8 @@ impl GuestQuotas {
             AppAddress::INSPECT if !is_here && OF_OWN_USERS.contains(&message.header.kind) => {
                 return Err(SubmitError::new(message, Rejection::Unsupported));
             }
+            // Guests have no part in the robot's stop, on any node.
+            AppAddress::STOP => return Err(SubmitError::new(message, Rejection::NotAllowed)),
             AppAddress::INSPECT if is_here => {
                 (&self.inspection, AT_INSPECTION_MAX, AT_INSPECTION_MAX / USERS)
             }
@@ -267,6 +270,9 @@ mod tests {
         assert_eq!(why(&quotas, elsewhere), Rejection::ForgedSource);
         for app in [AppAddress::SYNC, AppAddress::INSPECT] {
             assert_eq!(why(&quotas, message(NodeAddress::ALL, app)), Rejection::Unsupported);
+        }
+        for node in [HERE, THERE] {
+            assert_eq!(why(&quotas, message(node, AppAddress::STOP)), Rejection::NotAllowed);
         }
         for kind in OF_OWN_USERS {
             let mut frozen = message(THERE, AppAddress::INSPECT);

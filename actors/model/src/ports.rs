@@ -112,6 +112,9 @@ pub trait Members: Send + Sync {
     /// Returns the present nodes.
     fn present(&self) -> Vec<Member>;
 
+    /// Returns the present and the lost nodes. `None` while NDL is busy: the caller's thread does not wait for it.
+    fn in_brief(&self) -> Option<(Vec<Member>, Vec<LostMember>)>;
+
     /// Returns the received nodes of other projects if no other node of this project is present, else `None`.
     fn strangers_if_alone(&self) -> Option<Vec<ForeignNode>>;
 }

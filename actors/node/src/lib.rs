@@ -41,6 +41,7 @@ pub mod signals;
 #[cfg(test)]
 mod standstill_tests;
 mod state;
+mod stop;
 mod supervisor_spec;
 mod thread_placement;
 mod traffic;

@@ -89,10 +89,14 @@ pub(super) fn set_parameter_right(state: &NodeState) {
     state.ctx.router.set_parameter_right(parameter_right(state));
 }
 
+/// Returns whether the node is open and on loopback: then its own user is an operator where no list names one.
+pub(super) fn is_private(state: &NodeState) -> bool {
+    state.security.secured.get().is_none() && !state.ctx.config.is_beyond_host()
+}
+
 fn parameter_right(state: &NodeState) -> ParameterRight {
     let has_list = state.security.access.get().is_some();
-    let is_private = state.security.secured.get().is_none() && !state.ctx.config.is_beyond_host();
-    match (has_list, is_private) {
+    match (has_list, is_private(state)) {
         (true, _) => ParameterRight::Any,
         (false, true) => ParameterRight::OfNode(state.ctx.node),
         (false, false) => ParameterRight::Nobody,

@@ -98,6 +98,7 @@ impl NodeState {
         self.real_time.end();
         self.lncl.client_socket.close();
         self.ctx.router.remove_local(AppAddress::INSPECT);
+        self.ctx.router.remove_local(AppAddress::STOP);
         let recording = self.recording.end(self);
         self.types.close();
         self.gncl.store.close();

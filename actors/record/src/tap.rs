@@ -58,7 +58,10 @@ impl Tap for RecordTap {
     fn saw(&self, app: Tid, passage: &Passage<'_>) {
         let Passage { header, payload, length, refused, .. } = *passage;
         let (source, destination) = (header.source, header.destination);
-        if is_inspection(source, destination) {
+        // A program that reads a recording must not fill the ring with its own questions, nor must the nodes with the
+        // states of the stop that they exchange: a press is in the log, and is a trigger.
+        let is_stop = source.app == AppAddress::STOP && destination.app == AppAddress::STOP;
+        if is_inspection(source, destination) || is_stop {
             return;
         }
         if !self.chosen.has(source, destination, header.kind) && !self.chosen.has(app, app, header.kind) {

@@ -166,6 +166,12 @@ struct barrier {
     std::uint32_t flags = 0;
 };
 
+/// The state of the stop of the whole system, and its nodes, of which the first 64 are kept.
+struct stop_report {
+    sinew_stop_report state{};
+    std::vector<sinew_stop_node> nodes = std::vector<sinew_stop_node>(64);
+};
+
 /// A message under construction: a container of writable bytes. If it is not sent, its destructor discards
 /// it.
 class message {
@@ -600,6 +606,31 @@ public:
         detail::check(sinew_meet(raw_, &raw, &generation));
         return generation;
     }
+
+    /// Presses the stop of the whole system. Returns when all nodes have confirmed, and after this time at the latest:
+    /// look at `state.is_confirmed`. It is no safety function. After an error the stop may be pressed.
+    stop_report press_stop(std::string_view reason, duration within)
+    {
+        stop_report found;
+        const auto count = found.nodes.size();
+        detail::check(sinew_press_stop(raw_, detail::text(reason), detail::nanoseconds(within), found.nodes.data(), count, &found.state));
+        found.nodes.resize(found.state.nodes < count ? found.state.nodes : count);
+        return found;
+    }
+
+    /// Asks for the state of the stop.
+    [[nodiscard]] stop_report ask_stop(duration within)
+    {
+        stop_report found;
+        const auto count = found.nodes.size();
+        detail::check(sinew_ask_stop(raw_, detail::nanoseconds(within), found.nodes.data(), count, &found.state));
+        found.nodes.resize(found.state.nodes < count ? found.state.nodes : count);
+        return found;
+    }
+
+    /// Acknowledges a stop that is released, on the order of a person. While one is in force this is an error with the
+    /// status `SINEW_ERROR_NOT_HANDLED`.
+    void acknowledge_stop(duration within) { detail::check(sinew_acknowledge_stop(raw_, detail::nanoseconds(within))); }
 
     void join(std::string_view name) { detail::check(sinew_join_group(raw_, detail::text(name))); }
     void leave(std::string_view name) { detail::check(sinew_leave_group(raw_, detail::text(name))); }

@@ -9,7 +9,7 @@
 //! | `fork.rs` | detects a child of `fork` |
 //! | `log.rs`, `log/` | the library's log on the standard error, and the thread that writes it |
 //! | `protection.rs`, `protection/` | protected payloads: their types, and the runtime's guards behind handles |
-//! | `registration.rs`, `sending.rs`, `receiving.rs`, `meeting.rs`, `naming.rs`, `outcome.rs` | the functions |
+//! | `registration.rs`, `sending.rs`, `receiving.rs`, `meeting.rs`, `stopping.rs`, `naming.rs`, `outcome.rs` | the functions |
 //! | `sealing.rs`, `guarding.rs` | the functions for protected payloads |
 //! | `payload.rs`, `payload/` | typed payloads: a C struct as MessagePack, by a table of its fields |
 //! | `options.rs`, `text.rs`, `message.rs`, `status.rs` | the types |
@@ -30,6 +30,8 @@ mod receiving;
 mod payload;
 
 mod meeting;
+
+mod stopping;
 
 mod sealing;
 

@@ -262,7 +262,8 @@ pub(crate) const fn code_of(state: State) -> OutputState {
             Cause::TooManyBad => OutputState::SinewSafeTooManyBad,
             Cause::Restarted => OutputState::SinewSafeRestarted,
             Cause::Slept => OutputState::SinewSafeSlept,
-            Cause::Tripped => OutputState::SinewSafeTripped,
+            // The stop of a node makes these outputs safe by their silence: they read no latch.
+            Cause::Tripped | Cause::Stopped => OutputState::SinewSafeTripped,
             Cause::Dropped => OutputState::SinewSafeReleased,
         },
     }

@@ -13,7 +13,10 @@ use ground::{C, CPP, CPP20, Ground, WATCHDOG, endpoint, is_there};
 use rustix::process::Signal;
 use serde::{Deserialize, Serialize};
 use sinew::{
-    Class, Endpoint, NodeApi, Outcome, Payload, Registration, Tid, events::RequirementEvent, message::Kind,
+    AppAddress, Class, Endpoint, NodeApi, Outcome, Payload, Registration, Tid,
+    events::RequirementEvent,
+    message::Kind,
+    stop::{AskStop, StopReport, StopState},
 };
 
 /// As in `programs/holder.c`.
@@ -237,6 +240,20 @@ fn misuse_in_c_is_rejected_with_a_sentence() {
     }
     let ground = Ground::new();
     ground.run(&C.shared("tests/programs/misuse.c", &ground), "all refused");
+}
+
+#[test]
+fn c_program_presses_the_stop_and_acknowledges_it() {
+    if !is_there("gcc") {
+        return;
+    }
+    let ground = Ground::new();
+    ground.run(&C.shared("tests/programs/press.c", &ground), "pressed and released");
+    // The node has had both.
+    let mut asking = endpoint(&ground, Registration::new());
+    let to = Tid::new(asking.tid().node, AppAddress::STOP);
+    let report: StopReport = asking.message(to, &AskStop {}).ask(WATCHDOG).unwrap();
+    assert_eq!((report.state, report.presses.len()), (StopState::Released, 0), "{report:?}");
 }
 
 #[test]

@@ -16,6 +16,7 @@ mod reference;
 mod scenario;
 mod secured;
 mod send;
+mod stop;
 mod top;
 mod view;
 mod watch;

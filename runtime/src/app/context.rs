@@ -6,6 +6,7 @@ mod messages;
 mod parameters;
 mod recording;
 mod refusals;
+mod stop;
 mod timers;
 mod watches;
 

@@ -1,6 +1,9 @@
 //! A guarded output, which is safe unless good commands arrive.
 
+mod arming;
 mod guarded;
+#[cfg(test)]
+mod stop_tests;
 #[cfg(test)]
 mod tests;
 mod virtual_deadline;
@@ -19,6 +22,7 @@ use super::{
     raw::{NotSafeError, Protected, Reads, Released, or_panics},
     receiver::{Opened, Receiver, Verdict},
     safe_output::{self, CheckResult, WatchState, WatchedOutput, wake},
+    stop_latch::StopLatch,
 };
 use crate::{
     clock::{Clock, WakeUp},
@@ -160,22 +164,23 @@ impl<O: Send + 'static> Guard<O> {
         output: O,
         safe: impl FnMut(&mut O, Cause) -> Result<(), NotSafeError> + Send + 'static,
     ) -> io::Result<Self> {
-        Self::of_on(&Clock::WALL, (source, destination), protected, output, safe)
+        let node = (&Clock::WALL, &Arc::default());
+        Self::of_on(node, (source, destination), protected, output, safe)
     }
 
-    /// Same as [`new`](Self::new), on the clock of an application. On a virtual one the thread `safe-output`
-    /// is not used: `safe` is called when that clock reaches the deadline.
+    /// Same as [`new`](Self::new), on the clock of an application and with the stop of its node. On a virtual clock
+    /// the thread `safe-output` is not used: `safe` is called when that clock reaches the deadline.
     pub(crate) fn new_on<P: Payload>(
-        clock: &Clock,
+        node: (&Clock, &Arc<StopLatch>),
         ends: (Tid, Tid),
         output: O,
         safe: impl FnMut(&mut O, Cause) + Send + 'static,
     ) -> io::Result<Self> {
-        Self::of_on(clock, ends, Protected::of::<P>(), output, or_panics(safe))
+        Self::of_on(node, ends, Protected::of::<P>(), output, or_panics(safe))
     }
 
     fn of_on(
-        clock: &Clock,
+        (clock, stop): (&Clock, &Arc<StopLatch>),
         (source, destination): (Tid, Tid),
         protected: Protected,
         output: O,
@@ -192,7 +197,11 @@ impl<O: Send + 'static> Guard<O> {
         inner.make_safe(Cause::NotArmed, clock.now());
         inner.log_entry.take().into_iter().for_each(LogEntry::log);
         let deadline = inner.deadline();
-        let watch = Arc::new(WatchState::new(deadline, inner.retry.is_some()));
+        let watch = {
+            let stop = (stop.clone(), destination);
+            WatchState::new(deadline, inner.retry.is_some(), stop, protected.protection)
+        };
+        let watch = Arc::new(watch);
         let shared = Arc::new_cyclic(|output| Shared {
             data_id,
             inner: Mutex::new(inner),
@@ -239,31 +248,6 @@ impl<O: Send + 'static> Guard<O> {
                 State::Safe(cause) => Err(cause),
             }
         })
-    }
-
-    /// Arms the output: from now on commands pass. Call it after a check that this is safe; nothing arms an
-    /// output automatically.
-    ///
-    /// # Errors
-    /// Too few good messages have arrived, or the output could not be made safe.
-    pub fn arm(&self) -> Result<(), ArmError> {
-        self.shared().with(|inner| {
-            self.shared().retry_safe(inner, self.shared().clock.now());
-            if inner.retry.is_some() {
-                return Err(ArmError::SafeFails);
-            }
-            let is_released = self.is_released();
-            self.shared().decide_locked(inner, |receiver, now| {
-                if is_released {
-                    // Received messages do not count: the guard was released while the caller was about to arm it.
-                    receiver.trip(Cause::Dropped);
-                }
-                receiver.arm(now)
-            })
-        })?;
-        // The thread sleeps without a deadline, as there was none.
-        wake();
-        Ok(())
     }
 
     /// Makes the output safe: at once, or as soon as the application or thread that holds its lock releases it.
@@ -430,8 +414,12 @@ impl<O> Shared<O> {
         let (now, asleep) = self.clock.now_and_asleep();
         let (is_tripped, had_retry) =
             (self.watch.is_tripped.swap(false, Ordering::AcqRel), inner.retry.is_some());
+        let must_stop = self.watch.must_stop();
         let decided = inner.let_decide(now, |receiver| {
             receiver.has_slept(asleep);
+            if must_stop {
+                receiver.trip(Cause::Stopped);
+            }
             if is_tripped {
                 receiver.trip(Cause::Tripped);
             }

@@ -32,6 +32,7 @@
 //! | `guard` | the output |
 //! | `safe_output` | the thread `safe-output`, which makes outputs safe |
 //! | `overview` | the states of all outputs, for reports |
+//! | `stop_latch` | the stop of the node, which its outputs read |
 //! | `log_queue` | the log entries of that thread |
 //! | `ends` | both ends for an endpoint of NodeAPI |
 //! | `raw` | the same for types that are known at run time only |
@@ -49,6 +50,7 @@ pub mod raw;
 mod receiver;
 mod safe_output;
 mod sender;
+mod stop_latch;
 #[cfg(test)]
 mod tests;
 
@@ -56,14 +58,17 @@ use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
-#[doc(hidden)] // For the reports of a node.
-pub use self::overview::{OutputState, outputs};
 pub use self::{
     ends::{Came, Ends, SealError},
     envelope::{DataId, OVERHEAD, Stamp, Unsealed, open, seal, unsealed},
     guard::Guard,
 };
 pub(crate) use self::{guard::Guarded, receiver::Verdict, sender::Flows};
+#[doc(hidden)] // For a node: its reports, and its stop.
+pub use self::{
+    overview::{OutputState, StoppedOutputs, outputs, stopped_outputs},
+    stop_latch::{Latched, StopLatch},
+};
 pub use crate::wire::Protection;
 use crate::{
     time::Time,
@@ -134,6 +139,9 @@ pub enum Cause {
     /// The guard has no owner any more: its application has ended.
     #[error("the application that had it has ended")]
     Dropped,
+    /// The stop of the whole system was pressed.
+    #[error("the stop was pressed")]
+    Stopped,
 }
 
 /// The fault of a message.
@@ -197,6 +205,13 @@ pub enum ArmError {
     /// The safe function has panicked or reported a failure, and still does: whether the output is safe is unknown.
     #[error("the output's safe function panicked or failed, and is retried; see the log")]
     SafeFails,
+    /// The stop of the whole system is in force, its state is not known yet, or it was released and the application has
+    /// not acknowledged it.
+    #[error(
+        "the system is stopped, or this node does not know yet that it is not (`sinew stop status`), or the stop is released and not acknowledged \
+         (`Guard::acknowledge_stop`)"
+    )]
+    Stopped,
 }
 
 /// The counters of a receiver.

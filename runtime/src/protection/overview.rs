@@ -3,18 +3,22 @@
 //! A report never takes the lock of an output. A thread of low priority that held it could keep the thread
 //! `safe-output` from making the output safe. So each output publishes its state as a number.
 
-use std::sync::{
-    Arc, Mutex, Weak,
-    atomic::{AtomicU8, Ordering},
+use std::{
+    collections::BTreeSet,
+    sync::{
+        Arc, Mutex, Weak,
+        atomic::{AtomicU8, Ordering},
+    },
+    time::Duration,
 };
 
-use super::{Cause, DataId, State, safe_output::WatchState};
-use crate::lock;
+use super::{Cause, DataId, State, safe_output::WatchState, stop_latch::StopLatch};
+use crate::{lock, tid::NodeAddress};
 
 /// Maximum number of outputs in the list. Further ones work, and are in no report.
 const OUTPUTS_MAX: usize = 1_024;
 /// All causes. A published state is the place of its cause here, or their number.
-const CAUSES: [Cause; 8] = [
+const CAUSES: [Cause; 9] = [
     Cause::NotArmed,
     Cause::Silent,
     Cause::TooMuchLost,
@@ -23,6 +27,7 @@ const CAUSES: [Cause; 8] = [
     Cause::Slept,
     Cause::Tripped,
     Cause::Dropped,
+    Cause::Stopped,
 ];
 
 /// All outputs that are not dropped yet.
@@ -37,9 +42,16 @@ impl PublishedState {
         Self(AtomicU8::new(code(State::Safe(Cause::NotArmed))))
     }
 
-    /// Publishes a state. Nothing is decided by it, so it orders nothing.
+    /// Publishes a state.
+    ///
+    /// SYNC: the thread `safe-output` reads it in [`is_live`](Self::is_live), after a stop or an arm has woken it.
     pub(super) fn set(&self, state: State) {
-        self.0.store(code(state), Ordering::Relaxed);
+        self.0.store(code(state), Ordering::Release);
+    }
+
+    /// Returns whether the output was live when its state was published last.
+    pub(super) fn is_live(&self) -> bool {
+        self.0.load(Ordering::Acquire) == code(State::Live)
     }
 
     fn get(&self) -> State {
@@ -58,7 +70,8 @@ const fn code(state: State) -> u8 {
         State::Safe(Cause::Slept) => 5,
         State::Safe(Cause::Tripped) => 6,
         State::Safe(Cause::Dropped) => 7,
-        State::Live => 8,
+        State::Safe(Cause::Stopped) => 8,
+        State::Live => 9,
     }
 }
 
@@ -71,6 +84,32 @@ pub struct OutputState {
     pub state: State,
     /// Whether its safe function has failed and is retried: it may still be live.
     pub is_safe_failed: bool,
+}
+
+/// The outputs that one stop concerns, for its report.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct StoppedOutputs {
+    /// Their number.
+    pub outputs: u32,
+    /// Time after the last command of a stopped sender within which all of them are safe: an age of a command, and a
+    /// silence after it.
+    pub watchdog: Duration,
+    /// The nodes of the senders of their commands.
+    pub sources: BTreeSet<NodeAddress>,
+}
+
+/// Returns the outputs in this process that obey this stop.
+#[must_use]
+pub fn stopped_outputs(stop: &Arc<StopLatch>) -> StoppedOutputs {
+    let outputs = lock(&OUTPUTS);
+    let own = outputs.iter().filter_map(|(data_id, watch)| Some((data_id, watch.upgrade()?)));
+    let mut found = StoppedOutputs::default();
+    for (data_id, watch) in own.filter(|(_, watch)| Arc::ptr_eq(&watch.stop, stop)) {
+        found.outputs += 1;
+        found.watchdog = found.watchdog.max(watch.protection.age_max + watch.protection.within);
+        found.sources.insert(data_id.source.node);
+    }
+    found
 }
 
 /// Adds an output. It leaves the list when it is dropped.
@@ -113,8 +152,7 @@ mod tests {
 
     impl Payload for Torque {
         const NAME: &'static str = "test.overview.torque";
-        const PROTECTION: Option<Protection> =
-            Some(Protection::of_period(std::time::Duration::from_millis(20)));
+        const PROTECTION: Option<Protection> = Some(Protection::of_period(Duration::from_millis(20)));
     }
 
     fn states() -> Vec<OutputState> {

@@ -15,12 +15,14 @@ use std::{
 };
 
 use super::{
-    DataId, SAFE_OUTPUT_PRIORITY, State,
+    DataId, Protection, SAFE_OUTPUT_PRIORITY, State,
     log_queue::{self, LogEntry, PendingLog},
     overview::{self, PublishedState},
+    stop_latch::StopLatch,
 };
 use crate::{
     supervision::{realtime_priority, set_highest_priority},
+    tid::Tid,
     time::Time,
 };
 
@@ -49,17 +51,75 @@ pub(super) struct WatchState {
     pub(super) needs_retry: AtomicBool,
     /// The state of the output, for reports.
     pub(super) published: PublishedState,
+    /// The limits of the commands.
+    pub(super) protection: Protection,
+    /// The stop of the node.
+    pub(super) stop: Arc<StopLatch>,
+    /// The number of presses that the application has acknowledged.
+    acknowledged: AtomicU64,
+    /// Whether the output is counted at `stop` as not safe.
+    is_counted: AtomicBool,
 }
 
 impl WatchState {
-    pub(super) const fn new(deadline: u64, needs_retry: bool) -> Self {
-        Self {
+    pub(super) fn new(
+        deadline: u64,
+        needs_retry: bool,
+        (stop, app): (Arc<StopLatch>, Tid),
+        protection: Protection,
+    ) -> Self {
+        let acknowledged = stop.acknowledged(app);
+        let state = Self {
             deadline: AtomicU64::new(deadline),
             is_tripped: AtomicBool::new(false),
             is_releasing: AtomicBool::new(false),
             is_orphan: AtomicBool::new(false),
             needs_retry: AtomicBool::new(needs_retry),
             published: PublishedState::not_armed(),
+            protection,
+            stop,
+            acknowledged: AtomicU64::new(acknowledged),
+            is_counted: AtomicBool::new(false),
+        };
+        state.count(needs_retry);
+        state
+    }
+
+    /// Returns whether a stop was pressed that the application has not acknowledged.
+    #[inline]
+    pub(super) fn must_stop(&self) -> bool {
+        self.stop.read().presses() != self.acknowledged.load(Ordering::SeqCst)
+    }
+
+    /// Returns whether no stop forbids to arm the output.
+    pub(super) fn may_arm(&self) -> bool {
+        self.stop.read().is_released() && !self.must_stop()
+    }
+
+    /// Acknowledges all presses so far, if no stop is in force, for this output and those that `app` makes later. A
+    /// later press counts again.
+    pub(super) fn acknowledge(&self, app: Tid) -> bool {
+        let now = self.stop.read();
+        if now.is_stopped() {
+            return false;
+        }
+        if self.acknowledged.swap(now.presses(), Ordering::SeqCst) != now.presses() {
+            self.stop.record_acknowledged(app, now.presses());
+        }
+        true
+    }
+
+    /// Counts the output as not safe, or as safe. The caller holds its lock.
+    fn count(&self, is_not_safe: bool) {
+        // SYNC: by that lock. So a decision that changes nothing costs a load, and no exchange.
+        if self.is_counted.load(Ordering::Relaxed) == is_not_safe {
+            return;
+        }
+        self.is_counted.store(is_not_safe, Ordering::Relaxed);
+        if is_not_safe {
+            self.stop.count();
+        } else {
+            self.stop.discount();
         }
     }
 
@@ -67,6 +127,13 @@ impl WatchState {
     pub(super) fn publish(&self, needs_retry: bool, state: State) {
         self.needs_retry.store(needs_retry, Ordering::Release);
         self.published.set(state);
+        self.count(needs_retry || state == State::Live);
+    }
+}
+
+impl Drop for WatchState {
+    fn drop(&mut self) {
+        self.count(false);
     }
 }
 
@@ -307,7 +374,8 @@ impl WatchLoop {
         let (mut sleeps, mut at) = (IDLE, 0);
         while let Some(WatchEntry { watch, output }) = entries.get(at) {
             let left = Time::from_nanos(watch.deadline.load(Ordering::Acquire)).since(now);
-            if left.is_zero() || watch.is_tripped.load(Ordering::Acquire) {
+            let is_stopped = watch.must_stop() && watch.published.is_live();
+            if left.is_zero() || is_stopped || watch.is_tripped.load(Ordering::Acquire) {
                 due.push(output.clone());
             } else {
                 sleeps = sleeps.min(left);

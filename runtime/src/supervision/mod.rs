@@ -54,7 +54,7 @@ pub use self::{
     liveness::{at_fence, is_fenced},
     own_system::{detach_threads, log_system_stop},
     panics::UNWINDS,
-    place::{Owner, Place},
+    place::{Owner, Place, request_stop_priority},
     ready::{ReadyGate, ReadyPart},
     restarts::{ActorRestart, RestartObserver, observe_restarts},
     supervisor::{ChildSpec, Launch, PlannedChild, Supervisor, SupervisorFact, SupervisorPlan},

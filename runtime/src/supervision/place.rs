@@ -237,6 +237,15 @@ pub(crate) fn set_highest_priority(thread: &str, wanted: u8) -> u8 {
     has
 }
 
+/// Gives the calling thread the real-time priority `wanted`, or the highest one that is granted, and lets it run on any
+/// CPU. Returns the priority, 0 for none. For the thread of a node's stop: a control loop that never sleeps must not
+/// keep it from running. It logs nothing: the thread `safe-output` does.
+pub fn request_stop_priority(wanted: u8) -> u8 {
+    // If the system refuses, it stays where it is.
+    let _ = system::unpin();
+    request_priority(wanted)
+}
+
 /// Requests SCHED_FIFO with the priority `wanted`, or the highest one that is granted, for the calling thread.
 /// Returns the priority that it has then, 0 for none.
 pub(crate) fn request_priority(wanted: u8) -> u8 {

@@ -150,6 +150,9 @@ impl Kind {
     /// LNCL is full.
     pub const LNCL_TYPE: Self = Self(0x60);
 
+    /// The presses and releases of the stop that a node knows, and whether its outputs are safe.
+    pub const STOP_STATE: Self = Self(0x70);
+
     /// Requests a sign of life: confirmed, it ends as `Delivered` once its destination has handled it.
     pub const PING: Self = Self::named("sinew.ping");
 

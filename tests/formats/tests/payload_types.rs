@@ -19,6 +19,7 @@ use sinew::{
     },
     parameters::{AskParameters, ParameterList, ParameterOutcome, SetParameters},
     schema::{Schema, schema_of},
+    stop::{AcknowledgeStop, AskStop, PressStop, ReleaseStop, StopReport},
 };
 use sinew_model::barrier::{ArriveAtBarrier, BarrierAnswer, LeaveBarrier};
 
@@ -105,6 +106,7 @@ fn every_payload_type_of_this_tree_is_traced() {
         MismatchesReport NodeReport Ping ReachReport RecordReport ReloadReport SchemasReport TreeReport WatchReport
         ArriveAtBarrier BarrierAnswer LeaveBarrier
         AskParameters ParameterList ParameterOutcome SetParameters
+        AcknowledgeStop AskStop PressStop ReleaseStop StopReport
     };
     let mut names = BTreeSet::new();
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../..");

@@ -1,13 +1,13 @@
 //! The metrics of `sinew view` itself, and of each node as a whole.
 
-use sinew::Time;
+use sinew::{Time, stop::StopState};
 
 use super::{
     samples::Samples,
     table::{
         AGE, ENTRY_UP, LEFT_OUT, NODE_FIFO, NODE_IDLE_CLIENTS, NODE_LATENESS, NODE_LOST, NODE_STALL_LONGEST,
-        NODE_STALLS, NODE_STOPPING, NODE_TROUBLED, NODE_UP, NODE_UPTIME, RECORDER_DROPPED, RECORDER_SEEN,
-        REFUSED, TOOK,
+        NODE_STALLS, NODE_STOPPED, NODE_STOPPING, NODE_TROUBLED, NODE_UP, NODE_UPTIME, RECORDER_DROPPED,
+        RECORDER_SEEN, REFUSED, TOOK,
     },
 };
 use crate::{
@@ -58,6 +58,9 @@ pub(super) fn add_node(samples: &mut Samples, answers: &Answers, label: &str) {
     if let Some(stalls) = node.own_stalls {
         samples.count(&NODE_STALLS, [label], stalls.count);
         samples.level(&NODE_STALL_LONGEST, [label], micros(stalls.longest_us));
+    }
+    if let Some(stop) = node.stop {
+        samples.level(&NODE_STOPPED, [label], truth(stop == StopState::Stopped));
     }
     if let Some(measured) = &node.real_time {
         samples.level(&NODE_FIFO, [label], measured.granted.into());

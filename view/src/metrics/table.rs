@@ -105,6 +105,8 @@ pub(super) const RECORDER_SEEN: Metric = counter(
 );
 pub(super) const RECORDER_DROPPED: Metric =
     counter("recorder_dropped", &["node"], "Of these, the messages that are in no file.");
+pub(super) const NODE_STOPPED: Metric =
+    gauge("node_stopped", NODE, "Whether the stop of the whole system is in force at the node.");
 pub(super) const NODE_IDLE_CLIENTS: Metric =
     gauge("node_idle_clients", NODE, "Clients that do not read their queued messages.");
 pub(super) const REFUSED: Metric =
@@ -207,6 +209,7 @@ pub const METRICS: &[Metric] = &[
     NODE_STALLS,
     NODE_STALL_LONGEST,
     NODE_FIFO,
+    NODE_STOPPED,
     NODE_LATENESS,
     RECORDER_SEEN,
     RECORDER_DROPPED,

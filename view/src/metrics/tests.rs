@@ -15,6 +15,7 @@ use sinew::{
         TreeReport, WaitReport,
     },
     message::Class,
+    stop::StopState,
 };
 
 use super::{Format, METRICS, Shape, encode};
@@ -60,6 +61,7 @@ pub(crate) fn node_report(node: NodeAddress, name: &str) -> NodeReport {
         lost_echoes: Vec::new(),
         real_time: None,
         recording: None,
+        stop: None,
         guards: Vec::new(),
         guards_left_out: 0,
         refusals_left_out: 0,
@@ -95,6 +97,7 @@ pub(crate) fn snapshot() -> Snapshot {
     hip.own_stalls = Some(StallReport { count: 2, longest_us: 300_000, last_us: Some(1) });
     hip.real_time = Some(real_time());
     hip.recording = Some(RecordingReport { seen: 900, dropped: 3, ..RecordingReport::default() });
+    hip.stop = Some(StopState::Stopped);
     hip.peers = vec![peer()];
     hip.guards = [None, Some("Silent")].map(guard).to_vec();
     let knee = node_report(node(2), "knee");
@@ -314,6 +317,7 @@ fn samples_have_base_units_and_the_names_of_nodes() {
         ("sinew_barrier_wait_seconds{node=\"hip\",app=\"drive\"}", 7.0),
         ("sinew_barrier_blocked_seconds{node=\"hip\",app=\"toe\"}", 31.0),
         ("sinew_node_fifo_priority{node=\"hip\"}", 60.0),
+        ("sinew_node_stopped{node=\"hip\"}", 1.0),
         ("sinew_node_wake_lateness_seconds{node=\"hip\",quantile=\"0.999\"}", 90e-6),
         ("sinew_guard_safe{node=\"hip\",app=\"drive\"}", 1.0),
         ("sinew_guard_safe_cause{node=\"hip\",app=\"drive\",why=\"Silent\"}", 1.0),

@@ -100,6 +100,7 @@ fn each_page_has_its_path_and_others_are_refused() {
         }
     }
     assert_eq!(page(Method::PUT, "/api/parameters", &[]), Err(RequestError::Method("GET, POST")));
+    assert_eq!(page(Method::GET, "/api/stop", &[]), Err(RequestError::Method("POST")));
     let headers = HeaderMap::from_iter([(HOST, "localhost".parse().expect("a valid value"))]);
     let uri = Uri::from_static("/metrics");
     let with_body = Head { method: &Method::GET, uri: &uri, headers: &headers, has_body: true };
@@ -113,7 +114,9 @@ fn all_but_the_metrics_need_the_token() {
     for path in ["/", "/main.js", "/api/stream", "/api/parameters", "/api/nothing", "/?token=", "/?token=0"] {
         assert_eq!(asked(Method::GET, path, from_ref(&own)), Err(RequestError::NoToken), "{path}");
     }
-    assert_eq!(asked(Method::POST, "/api/parameters", from_ref(&own)), Err(RequestError::NoToken));
+    for path in ["/api/parameters", "/api/stop"] {
+        assert_eq!(asked(Method::POST, path, from_ref(&own)), Err(RequestError::NoToken), "{path}");
+    }
     let right = format!("/?token={}", token().text());
     assert_eq!(asked(Method::GET, &right, from_ref(&own)), Ok(Document::Login));
     // The token is in the address of the page alone.
@@ -127,6 +130,10 @@ fn only_the_page_itself_writes() {
     let post = |headers: &[(HeaderName, &str)]| page(Method::POST, "/api/parameters", headers);
     let own = (ORIGIN, "http://localhost:9464");
     assert_eq!(post(&[own.clone(), json.clone()]), Ok(Document::Set));
+    let stop = |headers: &[(HeaderName, &str)]| page(Method::POST, "/api/stop", headers);
+    assert_eq!(stop(&[own.clone(), json.clone()]), Ok(Document::Stop));
+    assert_eq!(stop(from_ref(&json)), Err(RequestError::OtherSite));
+    assert_eq!(stop(from_ref(&own)), Err(RequestError::NoJson));
     assert_eq!(
         post(&[own.clone(), json.clone(), (HeaderName::from_static(FETCH_SITE), "same-origin")]),
         Ok(Document::Set)

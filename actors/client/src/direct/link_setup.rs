@@ -72,6 +72,11 @@ impl Direct {
         None
     }
 
+    /// From now on no link is made automatically.
+    pub(crate) fn keep_to_node(&mut self) {
+        self.routes.keep_to_node();
+    }
+
     /// Handles the request of another endpoint for a link.
     fn on_introduction(&mut self, message: &Message, now: Time, node: &NodeWriter<'_>) {
         let Ok(Introduction { peer, number, pid: _ }) = payload::read(&message.payload) else { return };

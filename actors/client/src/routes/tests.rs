@@ -47,6 +47,16 @@ fn automatic_requests_link_at_eighth_message_within_a_second() {
 }
 
 #[test]
+fn endpoint_with_an_output_makes_no_automatic_link() {
+    for (links, is_made) in [(DirectLinks::Automatic, false), (DirectLinks::Always, true)] {
+        let mut routes = routes(links);
+        routes.keep_to_node();
+        assert_eq!(requested_at(&mut routes, tid(1), 0..20).is_some(), is_made);
+        assert_eq!(routes.on_introduction(tid(2)).is_ok(), is_made);
+    }
+}
+
+#[test]
 fn automatic_requests_no_link_for_seven_messages_per_second() {
     let even = |number: u64| number * 143;
     let burst = |number: u64| number / 7 * 1_000 + number % 7;

@@ -23,11 +23,11 @@ use super::{
 /// Longest configuration file in bytes.
 const FILE_BYTES_MAX: u64 = 1 << 20;
 
-const SECTIONS: [&str; 11] =
-    ["node", "lncl", "gncl", "ndl", "sync", "supervision", "security", "log", "record", "rt", "app"];
+const SECTIONS: [&str; 12] =
+    ["node", "lncl", "gncl", "ndl", "sync", "supervision", "security", "log", "record", "rt", "stop", "app"];
 
 /// Every key of every section.
-pub(super) const KEYS: [&str; 63] = [
+pub(super) const KEYS: [&str; 64] = [
     "node.name",
     "node.project",
     "node.address",
@@ -91,6 +91,7 @@ pub(super) const KEYS: [&str; 63] = [
     "record.max_bytes",
     "record.compression",
     "rt.probe_ms",
+    "stop.on_lost",
 ];
 
 impl NodeConfig {
@@ -139,6 +140,7 @@ impl NodeConfig {
         );
         reader.read_record(&mut config);
         reader.time(&check::PROBE, &mut config.rt.probe);
+        reader.truth("stop.on_lost", &mut config.stop.on_lost);
         config.app_settings = reader.app_settings.take().unwrap_or_default();
         let faults = reader.finish(&config).err().map(ConfigError::into_vec).unwrap_or_default();
         Ok((config, faults))

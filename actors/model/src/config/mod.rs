@@ -13,6 +13,7 @@ mod log_level;
 mod real_time;
 mod record;
 mod seeds;
+mod stop;
 #[cfg(test)]
 mod tests;
 mod time_policy;
@@ -41,6 +42,7 @@ pub use self::{
     log_level::LogLevel,
     real_time::RtConfig,
     record::{RecordCompression, RecordConfig},
+    stop::StopConfig,
     time_policy::TimePolicy,
     watch_group::WatchGroup,
 };
@@ -70,8 +72,8 @@ pub struct NodeConfig {
     /// if that interface is chosen by its name.
     pub address: Option<NodeAddress>,
     /// Directory for the state that the node keeps from one start to the next: the addresses at which its peers
-    /// answered, and kept parameters; 1 to 4,096 bytes. It is created if only itself is missing, with mode 0700.
-    /// Nodes of one user may share one. Default: none, the node keeps nothing.
+    /// answered, kept parameters, and the presses of the stop; 1 to 4,096 bytes. It is created if only itself is
+    /// missing, with mode 0700. Nodes of one user may share one. Default: none, the node keeps nothing.
     pub state: Option<PathBuf>,
     /// Maximum number of messages in an application's mailbox, per class. 1 to 65,536; default 256.
     pub mailbox_capacity: usize,
@@ -99,6 +101,8 @@ pub struct NodeConfig {
     pub record: RecordConfig,
     /// The measurement of the node's real-time behaviour.
     pub rt: RtConfig,
+    /// The stop of the whole system.
+    pub stop: StopConfig,
     /// The settings of applications: the tables `[app.NAME]` of its file, which [`NodeConfig::app`] reads.
     /// Default: none.
     pub app_settings: AppSettings,
@@ -425,6 +429,7 @@ impl NodeConfig {
             log: LogConfig::default(),
             record: RecordConfig::default(),
             rt: RtConfig::default(),
+            stop: StopConfig::default(),
             app_settings: AppSettings::default(),
         }
     }

@@ -258,6 +258,8 @@ fn state_security_and_times_accept_only_valid_values() {
         ("rt.probe_ms", "0".to_owned(), true),
         ("rt.probe_ms", "60000".to_owned(), true),
         ("rt.probe_ms", "60001".to_owned(), false),
+        ("stop.on_lost", "true".to_owned(), true),
+        ("stop.on_lost", "1".to_owned(), false),
         ("log.level", "'off'".to_owned(), true),
         ("log.level", "'trace'".to_owned(), true),
         ("log.level", "'verbose'".to_owned(), false),

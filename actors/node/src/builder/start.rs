@@ -24,7 +24,7 @@ use crate::{
     node::LAST_WORDS,
     play_check, process,
     root::{self, RootEvent},
-    security_setup, types,
+    security_setup, stop, types,
 };
 
 /// Maximum number of waiting applications in the log line of the start.
@@ -133,6 +133,7 @@ impl NodeBuilder {
             process::check_kernel().map_err(StartError::OwnProcess)?;
         }
         open_client_socket(&state)?;
+        stop::begin(&state)?;
         inspect::begin(&state)?;
         types::begin(&state)?;
         begin_recording(&state, self.writes_recording)?;

@@ -277,7 +277,10 @@ fn refused(error: &io::Error) -> CallError {
 impl From<ArmError> for CallError {
     fn from(error: ArmError) -> Self {
         match error {
-            ArmError::NotGood { .. } => Self::new(Status::SinewErrorNotGood, error.to_string()),
+            // No guard of this library has a stop.
+            ArmError::NotGood { .. } | ArmError::Stopped => {
+                Self::new(Status::SinewErrorNotGood, error.to_string())
+            }
             ArmError::SafeFails => Self::plain(Status::SinewErrorSafeFails),
         }
     }

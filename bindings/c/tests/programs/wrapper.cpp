@@ -349,6 +349,20 @@ static void guards_end_in_their_own_functions(const char *socket)
     EXPECT(state == SINEW_SAFE_NOT_ARMED);
 }
 
+// The last one: nothing releases the stop.
+static void stop_is_pressed(sinew::endpoint &endpoint)
+{
+    EXPECT(endpoint.ask_stop(20s).state.presses == 0);
+    const sinew::stop_report report = endpoint.press_stop("a test", 20s);
+    EXPECT(report.state.is_confirmed && report.nodes.size() == 1 && report.nodes[0].confirmed_ns != SINEW_STOP_NO_TIME);
+    try {
+        endpoint.acknowledge_stop(20s);
+        EXPECT(false);
+    } catch (const sinew::error &error) {
+        EXPECT(error.status() == SINEW_ERROR_NOT_HANDLED);
+    }
+}
+
 int main(int argc, char **argv)
 {
     const char *socket = argc > 1 ? argv[1] : "";
@@ -364,5 +378,6 @@ int main(int argc, char **argv)
     groups_and_names(socket);
     outputs_are_guarded(socket);
     guards_end_in_their_own_functions(socket);
+    stop_is_pressed(endpoint);
     std::puts("all well");
 }

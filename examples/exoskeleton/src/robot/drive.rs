@@ -178,6 +178,7 @@ impl Drive {
         if is_shut {
             self.core.distrust_gait();
         }
+        self.obey_stop(now);
         if let Some(Err(error)) = self.commands.as_mut().map(|commands| commands.poll(context)) {
             self.report_unguarded(&error);
         }

@@ -136,6 +136,9 @@ pub struct NodePlace {
     /// Path of the unix socket for processes of its host: the status screen (at central) and the `sinew`
     /// tool. 1 to 100 bytes; `None`: no socket.
     pub socket: Option<PathBuf>,
+    /// Directory of its state, which outlives it: with it a node that was stopped by `sinew stop` comes up
+    /// stopped. `None`: no state.
+    pub state: Option<PathBuf>,
     /// The process in which the drive of a joint runs; without meaning at central.
     pub drive: DrivePlace,
 }
@@ -226,6 +229,7 @@ impl Topology {
         config.ndl.missed_max = self.discovery.missed_max;
         config.security.keys = self.keys.as_ref().map(|keys| keys.join("nodes").join(part.name()));
         config.lncl.socket.clone_from(&place.socket);
+        config.state.clone_from(&place.state);
         config.record.keep_bytes = RECORD_KEEP_BYTES;
         if let Some(FlightRecorder { folder, frozen_folder }) = &self.record {
             config.record.folder = Some(folder.join(part.name()));

@@ -4,6 +4,7 @@ mod overload;
 mod real_time;
 mod secured;
 mod sockets;
+mod stop;
 
 use std::path::Path;
 use std::process::{Child, Command, Output};

@@ -80,8 +80,12 @@ impl<A: Actor<Context = Self>> AppContext<A> {
             );
             return Err(io::Error::new(io::ErrorKind::AlreadyExists, words));
         }
-        let guard = Guard::new_on::<P>(self.clock(), (source, self.tid()), output, safe)?;
+        let guard = {
+            let node = (self.sender.clock(), self.sender.stop());
+            Guard::new_on::<P>(node, (source, self.tid()), output, safe)?
+        };
         let guarded = guard.guarded();
+        self.sender.add_guarded_here();
         let protection =
             P::PROTECTION.expect("a guard is for a protected type: that was asserted when this was compiled");
         let echoed = guarded.clone();

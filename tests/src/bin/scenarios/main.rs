@@ -14,6 +14,7 @@ mod link_faults;
 mod recording;
 mod recovery;
 mod slow_consumer;
+mod stops;
 
 use std::process::ExitCode;
 
@@ -35,6 +36,7 @@ enum Scenario {
     Recording(recording::Arguments),
     Recovery(recovery::Arguments),
     SlowConsumer(slow_consumer::Arguments),
+    Stops(stops::Arguments),
 }
 
 fn main() -> ExitCode {
@@ -54,5 +56,6 @@ fn main() -> ExitCode {
         Scenario::Recording(arguments) => recording::execute(arguments),
         Scenario::Recovery(arguments) => recovery::execute(arguments),
         Scenario::SlowConsumer(arguments) => slow_consumer::execute(arguments),
+        Scenario::Stops(arguments) => stops::execute(arguments),
     }
 }

@@ -60,7 +60,7 @@ enum Kind {
 }
 
 /// Sections, in the order of the file, with a heading.
-const SECTIONS: [(&str, &str); 10] = [
+const SECTIONS: [(&str, &str); 11] = [
     ("node", "The node"),
     ("lncl", "Applications of this host"),
     ("gncl", "Connections between nodes"),
@@ -71,6 +71,7 @@ const SECTIONS: [(&str, &str); 10] = [
     ("log", "The default log"),
     ("record", "The recording"),
     ("rt", "The proof of real time"),
+    ("stop", "The stop of the whole system"),
 ];
 
 /// Longest cell of a table, and longest line of the complete file.

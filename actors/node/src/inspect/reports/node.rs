@@ -3,6 +3,7 @@
 use serde::{Deserialize, Serialize};
 use sinew_model::bounded::at_most;
 use sinew_runtime::{
+    stop::StopState,
     tid::{Incarnation, NodeAddress},
     wire::Payload,
 };
@@ -147,6 +148,9 @@ pub struct NodeReport {
     /// The state of its recording; `None`: an older version.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub recording: Option<RecordingReport>,
+    /// Whether the system is stopped, as the outputs of the node see it; `None`: an older version.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub stop: Option<StopState>,
     /// The outputs that applications in the node's process guard, in the order of their creation.
     #[serde(
         default,

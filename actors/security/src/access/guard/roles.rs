@@ -1,4 +1,4 @@
-//! Roles: which applications may set and read parameters, beside the rules.
+//! Roles: which applications may set and read parameters, beside the rules, and release the stop.
 
 use std::fmt;
 
@@ -30,8 +30,7 @@ impl Access {
             role.iter().any(|selector| selector.covers(self.here, header.source, name))
         };
         let roles = &index.list.roles;
-        let is_operator = has(&roles.operators) && !self.is_foreign(header.source);
-        if is_operator {
+        if self.is_operator(header.source) {
             return Some(true);
         }
         if !is_set {
@@ -40,6 +39,15 @@ impl Access {
         let (source, target) = (header.source, Tid::new(self.here, app));
         self.refusals.count(Time::now(), BY_LIST, &NoOperator(&index, source, target));
         Some(false)
+    }
+
+    /// Returns whether the application at `source` is an operator: it may set parameters of this node's applications,
+    /// and release the stop.
+    pub fn is_operator(&self, source: Tid) -> bool {
+        let index = self.index.load();
+        let name = index.name_of(source);
+        let is_named = |selector: &Selector| selector.covers(self.here, source, name);
+        index.list.roles.operators.iter().any(is_named) && !self.is_foreign(source)
     }
 
     /// Returns whether the application at `source` is or was one of a guest of this node. Guests have no part in the

@@ -4,7 +4,7 @@ use std::io;
 
 use exoskeleton_model::message::{DriveState, GaitState};
 use sinew::prelude::{AppContext, Delivery, Tid};
-use sinew::protection::{Guard, State};
+use sinew::protection::{ArmError, Guard, State};
 use sinew::time::Clock;
 
 use super::anomaly::Anomaly;
@@ -72,6 +72,12 @@ impl CentralCommands {
     /// Whether there are signs of manipulation.
     pub(super) const fn is_suspect(&self) -> bool {
         self.anomaly.is_there()
+    }
+
+    /// Acknowledges a released stop at both guards: the one that accepts requests obeys it, too.
+    pub(super) fn acknowledge_stop(&self) -> Result<(), ArmError> {
+        self.guard.acknowledge_stop()?;
+        self.arms.as_ref().map_or(Ok(()), Guard::acknowledge_stop)
     }
 
     /// Looks for an anomaly in the guard's counts, and accepts requests to open the guard while it is

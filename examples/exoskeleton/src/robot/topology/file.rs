@@ -67,6 +67,8 @@ struct NodeTable {
     seeds: Vec<String>,
     /// The socket for processes of the same host.
     socket: Option<PathBuf>,
+    /// Directory of its state, which outlives it.
+    state: Option<PathBuf>,
     /// The process in which the drive runs; at a joint only.
     drive: Option<DrivePlace>,
 }
@@ -157,9 +159,9 @@ fn node(faults: &mut Faults, part: Part, table: &NodeTable) -> Option<NodePlace>
     faults.note(part != Part::Central || table.drive.is_none(), || {
         "central.drive: central has none; take it out here".to_owned()
     });
-    let drive = table.drive.unwrap_or_default();
+    let (state, drive) = (table.state.clone(), table.drive.unwrap_or_default());
     let (address, port) = (NodeAddress::from(address?), table.port);
-    Some(NodePlace { address, interface: interface?, port, seeds, socket, drive })
+    Some(NodePlace { address, interface: interface?, port, seeds, socket, state, drive })
 }
 
 fn seeds(faults: &mut Faults, place: &str, texts: &[String]) -> Vec<Seed> {
@@ -257,6 +259,7 @@ pub(super) fn write(topology: &Topology) -> String {
             port: place.port,
             seeds: place.seeds.iter().map(ToString::to_string).collect(),
             socket: place.socket.clone(),
+            state: place.state.clone(),
             drive: (place.drive == DrivePlace::Process && part != Part::Central).then_some(place.drive),
         }
     };

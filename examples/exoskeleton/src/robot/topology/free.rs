@@ -35,6 +35,7 @@ pub fn for_this_host(seed: u64) -> io::Result<Topology> {
         port: 0,
         seeds: Vec::new(),
         socket: Some(socket_path(id, part)),
+        state: None,
         drive: DrivePlace::Node,
     };
     Ok(Topology {

@@ -461,6 +461,13 @@ pub(super) const ROWS: &[Row] = &[
         effect: "Time for which a thread measures at 1 kHz, after the start, how late it wakes; `sinew nodes` shows the result; 0: off.",
         note: "2 to 4 % of a CPU for this time, with priority 90 where it is granted. The node is ready before.",
     },
+    Row {
+        key: "stop.on_lost",
+        kind: Kind::Truth,
+        value: |config| json!(config.stop.on_lost),
+        effect: "Whether this node presses the stop of the whole system when it loses another node without its farewell.",
+        note: "A node that is cut off then stops by itself, also where it commands its own outputs.",
+    },
 ];
 
 fn millis(duration: Duration) -> Value {
