@@ -138,10 +138,7 @@ pub extern "C" fn sinew_acknowledge_stop(endpoint: *mut Endpoint, within_ns: u64
     call(|| {
         let within = Duration::from_nanos(within_ns).min(WITHIN_MAX);
         let outcome = with(endpoint, |session| Ok(session.endpoint().acknowledge_stop(within)?))?;
-        match outcome {
-            Outcome::Delivered => Ok(Status::SinewOk),
-            other => Err(ApiError::Ended(other).into()),
-        }
+        if outcome == Outcome::Delivered { Ok(Status::SinewOk) } else { Err(ApiError::Ended(outcome).into()) }
     })
 }
 

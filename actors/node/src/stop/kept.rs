@@ -1,7 +1,7 @@
 //! The presses and releases in the state directory: a node that was stopped comes up stopped. spec: STOP-7
 
 use std::{
-    path::PathBuf,
+    path::Path,
     sync::mpsc::{Receiver, SyncSender, TrySendError, sync_channel},
     thread,
 };
@@ -87,7 +87,7 @@ impl Kept {
     }
 }
 
-fn read(path: &PathBuf) -> Result<Stops, String> {
+fn read(path: &Path) -> Result<Stops, String> {
     let Some(bytes) = files::own(path, BYTES_MAX).map_err(|why| why.to_string())? else {
         return Ok(Stops::default());
     };
