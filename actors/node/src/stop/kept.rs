@@ -113,7 +113,7 @@ fn unreadable(context: &NodeContext) -> Stops {
     std::iter::once(entry).collect()
 }
 
-fn write(path: &std::path::Path, changed: &Receiver<Vec<Entry>>) {
+fn write(path: &Path, changed: &Receiver<Vec<Entry>>) {
     lower_priority();
     let mut has_failed = false;
     while let Ok(entries) = changed.recv() {

@@ -76,8 +76,8 @@ fn panic_is_reported_once_with_actor_place_and_frames() {
 struct Errors(Mutex<Vec<String>>);
 
 impl LogObserver for Errors {
-    fn wrote(&self, level: log::tracing::Level, _: &str, text: &str) {
-        if level == log::tracing::Level::ERROR {
+    fn wrote(&self, level: tracing::Level, _: &str, text: &str) {
+        if level == tracing::Level::ERROR {
             self.0.lock().unwrap().push(text.to_owned());
         }
     }
