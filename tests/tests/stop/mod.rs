@@ -185,7 +185,6 @@ fn all_nodes_confirm_and_a_release_moves_nothing() {
         robot.view.starts_again.store(true, Ordering::SeqCst);
         robot.view.wait_until_it_moves();
     }
-    drop(network);
 }
 
 #[test]
