@@ -228,7 +228,8 @@ impl<S: Socket> WriterState<S> {
         Step::Done
     }
 
-    /// Whether a frame can be written now.
+    /// Whether a frame can be written now. Each step that makes this true wakes the drain task, now or
+    /// [later](super::delayed_wake): an ACK does not wake it again.
     pub(super) fn has_frame(&self) -> bool {
         let waits = !self.unsent.is_empty();
         self.connection.is_within_frame()
