@@ -90,6 +90,10 @@ impl<S: Socket> WriterState<S> {
         self.connection.write_gathered();
         self.connection.wrote_delayed();
         self.bursts.written(Time::now());
+        if !self.connection.is_up() {
+            // The drain task reports the failed write. Its delayed wake has ended with the socket.
+            self.connection.wake_drainer(deferred);
+        }
     }
 
     /// Whether the number of queued messages is so high that the sender should write them itself.
