@@ -194,13 +194,20 @@ impl Pending {
         let waker = lock(&self.inner).settle(id, from, &mut settlement);
         waker.into_iter().for_each(wakes::wake);
     }
+}
 
-    /// Settles these messages under one lock, then wakes those that wait for them.
-    fn settle_together(&self, outcomes: &[Option<(Ticket, Outcome)>; SETTLED_TOGETHER]) {
+/// Messages that are settled under one lock at its end, also if an observer of one panics: no other code settles them.
+struct Together<'a> {
+    pending: &'a Pending,
+    outcomes: [Option<(Ticket, Outcome)>; SETTLED_TOGETHER],
+}
+
+impl Drop for Together<'_> {
+    fn drop(&mut self) {
         let mut wakers = [const { None }; SETTLED_TOGETHER];
         {
-            let mut inner = lock(&self.inner);
-            for ((ticket, outcome), waker) in outcomes.iter().flatten().zip(&mut wakers) {
+            let mut inner = lock(&self.pending.inner);
+            for ((ticket, outcome), waker) in self.outcomes.iter().flatten().zip(&mut wakers) {
                 let mut settlement = Some(Settlement::Outcome(*outcome));
                 *waker = inner.settle(ticket.correlation, ticket.destination, &mut settlement);
             }
@@ -242,14 +249,13 @@ impl ReceiptSink for Pending {
 
     fn settle_all(&self, outcomes: &mut dyn Iterator<Item = (Ticket, Outcome)>) {
         loop {
-            let mut together = [const { None }; SETTLED_TOGETHER];
-            for (place, (ticket, outcome)) in together.iter_mut().zip(&mut *outcomes) {
+            let mut together = Together { pending: self, outcomes: [const { None }; SETTLED_TOGETHER] };
+            for (place, (ticket, outcome)) in together.outcomes.iter_mut().zip(&mut *outcomes) {
+                *place = Some((ticket, outcome));
                 // Observers are called without the lock, and before the application can see the outcome.
                 outcome::show(ticket, outcome);
-                *place = Some((ticket, outcome));
             }
-            self.settle_together(&together);
-            if together.last().is_none_or(Option::is_none) {
+            if together.outcomes.last().is_none_or(Option::is_none) {
                 return;
             }
         }

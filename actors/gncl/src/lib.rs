@@ -22,7 +22,7 @@
 //! | GNCL-14 | If both know `classes`, the dialler of a link also dials a connection for Stream and one for Bulk, pinged every 10 s at rest. |
 //! | GNCL-15 | A requester that stops waiting for a reply sends CANCEL, to a peer that knows it: a request that still waits ends as `Expired`. |
 //! | GNCL-16 | All addresses that a peer announces are dialled, 20 ms apart; the first that is reached stays, the others are closed. |
-//! | GNCL-17 | Queued outcomes are sent several in one frame, to a peer that knows `outcomes`. |
+//! | GNCL-17 | Queued outcomes are sent several in one frame, to a peer that knows `outcomes`, or as runs to one that knows `outcome-runs`. |
 //! | GNCL-19 | If long packets do not arrive at a peer, connections to it use segments that do. |
 //! | GNCL-20 | Unconfirmed messages that were refused are reported to their sender's node, if it knows `undelivered`: at most one frame in 100 ms. |
 //! | GNCL-13 | When a connection ends, nothing is lost (package `sinew-session`); when the node is lost, sent messages are `Unknown`, waiting ones `PeerLost`. |

@@ -48,13 +48,19 @@ pub fn show_members(ticket: Ticket, reports: &[MemberReport]) {
 
 #[cfg(test)]
 mod tests {
-    use std::sync::Mutex;
+    use std::{
+        panic::{AssertUnwindSafe, catch_unwind},
+        sync::Mutex,
+        task::{Context, Poll},
+    };
+
+    use futures_util::task::noop_waker;
 
     use super::*;
     use crate::{
         lock,
-        outcome::{ReceiptSink, Rejection},
-        pending::{Awaited, Pending},
+        outcome::{Receipt, ReceiptSink, Rejection},
+        pending::{Awaited, Pending, Settlement},
         tid::{AppAddress, NodeAddress, Tid},
     };
 
@@ -89,5 +95,38 @@ mod tests {
         stop_observing(&observer);
         show(ticket, Outcome::Unknown);
         assert_eq!(*lock(&notes.0), [(member, full), (drives, Outcome::Delivered)]);
+    }
+
+    #[test]
+    fn observer_that_panics_leaves_no_message_without_outcome() {
+        /// An application that no other test has, either.
+        const WATCHED: Tid = Tid::new(NodeAddress::new(0x7f00_0063), AppAddress::new(0x1065));
+
+        struct Panics;
+
+        impl OutcomeObserver for Panics {
+            fn settled(&self, ticket: Ticket, _: Outcome) {
+                assert!(ticket.source != WATCHED || ticket.correlation != 2, "a fault of the observer's");
+            }
+        }
+
+        let observer: Arc<dyn OutcomeObserver> = Arc::new(Panics);
+        assert!(observe(&observer, None));
+        let pending = Pending::new(3);
+        let waits = [(); 3].map(|()| pending.open(Awaited::Outcome, Tid::NONE).expect("it has room"));
+        let receipt = |correlation| {
+            let ticket = Ticket { source: WATCHED, destination: Tid::NONE, correlation };
+            (Receipt::new(pending.clone(), ticket), Outcome::Delivered)
+        };
+        let mut receipts: Vec<_> = waits.iter().map(|wait| receipt(wait.correlation())).collect();
+        let settled = catch_unwind(AssertUnwindSafe(move || Receipt::settle_all(&mut receipts)));
+        stop_observing(&observer);
+        assert!(settled.is_err());
+        let settlements = waits.map(|wait| wait.poll_settled(&Context::from_waker(&noop_waker())));
+        for (settlement, expected) in
+            settlements.into_iter().zip([Outcome::Delivered, Outcome::Delivered, Outcome::Failed])
+        {
+            assert!(matches!(settlement, Poll::Ready(Settlement::Outcome(outcome)) if outcome == expected));
+        }
     }
 }

@@ -16,11 +16,11 @@ use tokio::{io::unix::AsyncFd, runtime::Handle};
 /// Delay in nanoseconds that lets more delayable messages arrive. Waking a thread on an idle CPU takes about
 /// half of it, and so does a write of 32 KiB.
 const WAKE_DELAY_NS: i64 = 50_000;
-/// Messages within a delay that postpone the wake by another delay: a call of the system for so many costs less than a
-/// wake, and fewer do not soon become as many as the sender [writes itself](super::draining).
+/// Number of messages within a delay that postpone the wake by another delay. Setting the timer for so many costs less
+/// than a wake. With fewer, the sender does not soon have as many as it [writes itself](super::draining).
 const JOINED: u32 = 16;
-/// Maximum number of delays by which a wake is postponed: the sender writes after as many messages. The first message
-/// waits for 400 us at most.
+/// Maximum number of delays by which a wake is postponed. With one more, the sender has the 128 messages at which it
+/// writes itself. The first message waits for 400 us at most.
 const POSTPONED_MAX: u32 = 7;
 
 thread_local! {

@@ -90,6 +90,10 @@ impl<S: Socket> WriterState<S> {
         self.connection.write_gathered();
         self.connection.wrote_delayed();
         self.bursts.written(Time::now());
+        if !self.connection.is_up() {
+            // The drain task reports the failed write. Its delayed wake has ended with the socket.
+            self.connection.wake_drainer(deferred);
+        }
     }
 
     /// Whether the number of queued messages is so high that the sender should write them itself.
@@ -228,7 +232,8 @@ impl<S: Socket> WriterState<S> {
         Step::Done
     }
 
-    /// Whether a frame can be written now.
+    /// Whether a frame can be written now. Each step that makes this true wakes the drain task, now or
+    /// [later](super::delayed_wake): an ACK does not wake it again.
     pub(super) fn has_frame(&self) -> bool {
         let waits = !self.unsent.is_empty();
         self.connection.is_within_frame()

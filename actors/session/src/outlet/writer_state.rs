@@ -411,6 +411,10 @@ impl<S: Socket> WriterState<S> {
         self.counters.counts.expired += 1;
         deferred.settle(message.receipt.map(|receipt| (receipt, Outcome::Expired)));
         self.receipts.wake_if_fewer_open(deferred);
+        if self.link_frames.is_last_pending() {
+            // That frame may have waited for this message alone.
+            self.connection.wake_drainer(deferred);
+        }
     }
 
     /// Cancels a request that no caller awaits any more: it expires unless it has been started. Returns

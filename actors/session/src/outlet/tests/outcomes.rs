@@ -23,14 +23,19 @@ fn outcome(correlation: u64) -> Message {
 /// Both kinds of frames with several outcomes.
 const FRAMES: [Kind; 2] = [Kind::GNCL_OUTCOMES, Kind::GNCL_OUTCOME_RUNS];
 
-/// An outlet with a peer that supports several in one frame of this kind, or not; its wire accepts nothing yet.
-fn bench(frame: Option<Kind>, payload_max: usize) -> Bench {
+/// An outlet to a peer that supports several in one frame of this kind, or not.
+fn outlet<S: Socket>(frame: Option<Kind>) -> SocketWriter<S> {
     let gncl = |node| Tid::new(node, AppAddress::GNCL);
     let header = |kind| Header::new(kind, gncl(NodeAddress::new(1)), gncl(FAR));
     let outcomes = frame.map(header);
     let window = Window { messages: 64, bytes: PLENTY };
     let session = Session::new(1, window, header(Kind::GNCL_VOID), outcomes);
-    let outlet = SocketWriter::with_session(OutletLimits { payload_max: 10_000, ..LIMITS }, session);
+    SocketWriter::with_session(OutletLimits { payload_max: 10_000, ..LIMITS }, session)
+}
+
+/// The same, with a wire that accepts nothing yet.
+fn bench(frame: Option<Kind>, payload_max: usize) -> Bench {
+    let outlet = outlet(frame);
     let wire = Arc::new(Wire::default());
     let link = outlet.connect(wire.clone(), payload_max, None);
     let bench = Bench { outlet, wire, link, outcome_log: Arc::default() };
@@ -38,9 +43,12 @@ fn bench(frame: Option<Kind>, payload_max: usize) -> Bench {
     bench
 }
 
+fn ack(next: u64) -> Ack {
+    Ack { receiver_id: 1, epoch: 1, peer_epoch: 1, next, change: 0, held: Vec::new(), room: None }
+}
+
 fn receive_ack(bench: &Bench, next: u64) {
-    let ack = Ack { receiver_id: 1, epoch: 1, peer_epoch: 1, next, change: 0, held: Vec::new(), room: None };
-    bench.outlet.on_ack(bench.link, &ack, Time::now());
+    bench.outlet.on_ack(bench.link, &ack(next), Time::now());
 }
 
 /// Returns the application, the correlation and the byte of each outcome in a frame with several.
@@ -207,6 +215,28 @@ fn waiting_outcomes_are_divided_for_a_shorter_frame() {
         let (account, _) = bench.outlet.account();
         assert_eq!((account.taken, account.arrived), (frames, frames), "as the receiver counts them");
     }
+}
+
+#[test]
+fn failed_write_of_added_outcomes_is_reported() {
+    // Given: 127 outcomes wait as one, and the drain task waits for the socket.
+    let (outlet, wire) = (outlet(Some(Kind::GNCL_OUTCOME_RUNS)), Arc::<Wire>::default());
+    let link = outlet.connect(Gathering::new(wire.clone(), Checksum::Crc), usize::MAX, None);
+    outlet.on_ack(link, &ack(1), Time::now());
+    let report = |correlation| {
+        outlet.report_outcome(ticket(correlation), Outcome::Delivered, usize::MAX).unwrap();
+    };
+    (1..=127).for_each(report);
+    assert_eq!(outlet.waiting(), 1);
+    assert!(outlet.drain(link).now_or_never().is_none());
+    let is_asleep = || outlet.lock().connection.is_drainer_asleep();
+    assert!(is_asleep());
+    // When: the next one makes its sender write them all, and the connection has ended.
+    wire.fails.store(true, Ordering::Relaxed);
+    report(128);
+    // Then
+    assert!(!is_asleep());
+    assert!(outlet.drain(link).now_or_never().is_some(), "it reports the end");
 }
 
 #[test]

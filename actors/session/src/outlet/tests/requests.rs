@@ -85,6 +85,33 @@ fn request_is_cancelled_in_line_of_held_destination() {
 }
 
 #[test]
+fn last_frame_is_sent_once_no_message_waits() {
+    let removals: [fn(&Bench, Ticket); 2] = [
+        |bench, ticket| assert!(bench.outlet.cancel(ticket)),
+        |bench, _| _ = bench.outlet.expire(Time::now() + Duration::from_secs(61)),
+    ];
+    for remove in removals {
+        // Given: the last frame waits for a request to a destination that accepts nothing.
+        let bench = session(PLENTY);
+        let mut request = request(&bench, 1);
+        (request.header.sent, request.header.time_to_live_us) = (Time::now(), 60_000_000);
+        receive_ack(&bench, 1, vec![u64::from(request.header.destination.app.bits())]);
+        let ticket = request.ticket();
+        bench.submit(request);
+        bench.outlet.finish(message(Class::Control, 9));
+        bench.drain();
+        let is_asleep = || bench.outlet.lock().connection.is_drainer_asleep();
+        assert!(is_asleep() && bench.outlet.in_backlog() == 1);
+        // When
+        remove(&bench, ticket);
+        // Then
+        assert!(!is_asleep(), "no ACK need follow");
+        bench.drain();
+        assert_eq!(bench.seen(), [9]);
+    }
+}
+
+#[test]
 fn request_cancelled_while_disconnected_is_not_resent() {
     for (has_arrived, sent_again) in
         [(false, vec![Kind::GNCL_VOID, Kind::CANCEL]), (true, vec![Kind::CANCEL])]
