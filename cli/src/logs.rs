@@ -97,6 +97,7 @@ pub(crate) fn show(system: &mut System, order: &Order, is_json: bool) -> Result<
     let is_over = || stop.as_ref().is_some_and(StopRequest::is_there);
     loop {
         let Some(has_more) = reader.round(system, &is_over) else { break };
+        system.discard();
         let is_last = is_over() || !(order.follow || has_more);
         if !reader.print(is_last) || is_last {
             break;
