@@ -96,7 +96,8 @@ pub(crate) fn show(system: &mut System, order: &Order, is_json: bool) -> Result<
     let mut nodes_due = began + NODES_PERIOD;
     let is_over = || stop.as_ref().is_some_and(StopRequest::is_there);
     loop {
-        let has_more = reader.round(system, &is_over);
+        let Some(has_more) = reader.round(system, &is_over) else { break };
+        system.discard();
         let is_last = is_over() || !(order.follow || has_more);
         if !reader.print(is_last) || is_last {
             break;
@@ -155,42 +156,52 @@ impl<'o> Reader<'o> {
         !wanted.is_empty()
     }
 
-    /// Reads each node up to now. Returns whether there are further lines.
-    fn round(&mut self, system: &mut System, is_over: &dyn Fn() -> bool) -> bool {
-        let within = if self.order.follow { system.within.min(FOLLOWED_WITHIN) } else { system.within };
+    /// Reads each node up to now. Returns whether there are further lines; `None` if there is no reader any more.
+    fn round(&mut self, system: &mut System, is_over: &dyn Fn() -> bool) -> Option<bool> {
         let mut has_more = false;
-        for source in self.sources.values_mut() {
-            if Time::now() < source.due || is_over() {
-                continue;
+        for node in self.sources.keys().copied().collect::<Vec<_>>() {
+            if is_over() {
+                break;
             }
-            for _ in 0..QUESTIONS_MAX {
-                let question = source.question(self.order.level.word());
-                let to = Tid::new(source.node, AppAddress::INSPECT);
-                match system.endpoint.message(to, &question).ask::<LogsReport>(within) {
-                    Ok(report) => {
-                        let entries = source.take(report, Time::now());
-                        entries.into_iter().for_each(|entry| self.merge.push(entry));
-                        if source.fault.take().is_some() {
-                            self.screen.state(&source.node.to_string(), &source.name, None);
-                        }
-                    }
-                    Err(error) => {
-                        let why = in_words(&error);
-                        if source.fault.is_none() {
-                            self.screen.state(&source.node.to_string(), &source.name, Some(&why));
-                        }
-                        (source.fault, source.more) = (Some(why), false);
-                        source.due = Time::now() + RETRY_PERIOD;
-                    }
-                }
-                if !source.more {
-                    break;
-                }
+            has_more |= self.read(system, node);
+            if self.merge.is_full() && !self.print(false) {
+                return None;
             }
-            // A node that logs faster than it is read is not read without end.
-            has_more |= source.more && (self.order.follow || source.read_ns < self.began.as_nanos());
         }
-        has_more
+        Some(has_more)
+    }
+
+    /// Reads a node up to now. Returns whether it has further lines.
+    fn read(&mut self, system: &mut System, node: NodeAddress) -> bool {
+        let within = if self.order.follow { system.within.min(FOLLOWED_WITHIN) } else { system.within };
+        let to = Tid::new(node, AppAddress::INSPECT);
+        let source = self.sources.get_mut(&node).filter(|source| Time::now() >= source.due);
+        let Some(source) = source else { return false };
+        for _ in 0..QUESTIONS_MAX {
+            let question = source.question(self.order.level.word());
+            match system.endpoint.message(to, &question).ask::<LogsReport>(within) {
+                Ok(report) => {
+                    let entries = source.take(report, Time::now());
+                    entries.into_iter().for_each(|entry| self.merge.push(entry));
+                    if source.fault.take().is_some() {
+                        self.screen.state(&node.to_string(), &source.name, None);
+                    }
+                }
+                Err(error) => {
+                    let why = in_words(&error);
+                    if source.fault.is_none() {
+                        self.screen.state(&node.to_string(), &source.name, Some(&why));
+                    }
+                    (source.fault, source.more) = (Some(why), false);
+                    source.due = Time::now() + RETRY_PERIOD;
+                }
+            }
+            if !source.more {
+                break;
+            }
+        }
+        // A node that logs faster than it is read is not read without end.
+        source.more && (self.order.follow || source.read_ns < self.began.as_nanos())
     }
 
     /// Prints the lines up to the time up to which all nodes were read, or all lines. Returns whether there is still a

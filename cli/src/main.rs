@@ -5,8 +5,8 @@
 //! its access list again, `param` sets parameters of applications, and `stop` presses and releases the stop. `record`
 //! has the node record its messages, and writes them to a file. `play` sends them again, by a node of its own unless
 //! told otherwise. `keys` asks no node: it creates the files by which nodes authenticate each other. `bag` reads the
-//! files of recordings. `view` keeps asking all nodes, for programs that read their metrics, and `top`
-//! for its screen.
+//! files of recordings. `view` keeps asking all nodes, for programs that read their metrics, `top` for its
+//! screen, and `logs -f` for new lines.
 
 #![warn(clippy::print_stdout, clippy::print_stderr)] // `output` prints: the macros panic where a pipe is closed or a disk is full.
 

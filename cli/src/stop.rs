@@ -174,7 +174,8 @@ fn text(report: &StopReport, is_wide: bool) -> String {
     text
 }
 
-const fn state(state: Option<StopState>) -> &'static str {
+/// Returns the word for a state; `None` is that of a node without an answer.
+pub(crate) const fn state(state: Option<StopState>) -> &'static str {
     match state {
         Some(StopState::Released) => "released",
         Some(StopState::Held) => "held",

@@ -24,6 +24,8 @@ use crate::{
 pub(crate) const REQUESTERS_MAX: usize = 8;
 /// Time limit to ask the further nodes of this host for their projects. One answers within a few milliseconds.
 const PROJECTS_WITHIN: Duration = Duration::from_millis(300);
+/// Maximum number of messages to all applications that are dropped at once.
+const DISCARDED_MAX: usize = 4_096;
 /// Time limit for the registration.
 const REGISTERED_WITHIN: Duration = Duration::from_secs(5);
 
@@ -162,6 +164,16 @@ impl System {
     /// Disconnects from the system.
     pub(crate) fn leave(self) {
         leave(self.endpoint);
+    }
+
+    /// Reads and drops messages to all applications. A command that stays does so between its questions: a node reports
+    /// clients that do not read, and without room further messages are refused.
+    pub(crate) fn discard(&mut self) {
+        for _ in 0..DISCARDED_MAX {
+            if !matches!(self.endpoint.receive(Duration::ZERO), Ok(Some(_))) {
+                return;
+            }
+        }
     }
 
     /// Returns the report of the entry node about itself and the nodes that it knows.

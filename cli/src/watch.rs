@@ -191,6 +191,7 @@ impl Watched {
     /// # Errors
     /// There was no answer several times in a row.
     fn ask(&mut self, system: &mut System, screen: &Screen) -> Result<Option<WatchReport>, SystemError> {
+        system.discard();
         let mut all: Option<WatchReport> = self.questions.is_empty().then(WatchReport::default);
         let mut failed = None;
         for question in &self.questions {

@@ -4,8 +4,10 @@ use std::{cmp::Reverse, collections::BinaryHeap};
 
 use sinew::NodeAddress;
 
-/// Maximum number of lines that wait for older ones of other nodes. Beyond it the oldest ones are released.
+/// Maximum number of lines that wait for older ones of other nodes, and maximum bytes of their texts. Beyond these the
+/// oldest ones are released.
 const HELD_MAX: usize = 65_536;
+const HELD_BYTES_MAX: usize = 64 << 20;
 
 /// A line of a node, or a gap in its lines. The order of the fields is the order of the output.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -16,6 +18,15 @@ pub(super) struct Entry {
     /// The number of the line; of a gap, that of the line after it.
     pub(super) number: u64,
     pub(super) content: Content,
+}
+
+impl Entry {
+    const fn bytes(&self) -> usize {
+        match &self.content {
+            Content::Lost(_) => 0,
+            Content::Line { level, target, text } => level.len() + target.len() + text.len(),
+        }
+    }
 }
 
 /// The content of an entry. A gap is before the line with the same number.
@@ -32,20 +43,31 @@ pub(super) enum Content {
 
 /// Lines that were read, and are not shown yet.
 #[derive(Debug, Default)]
-pub(super) struct Merge(BinaryHeap<Reverse<Entry>>);
+pub(super) struct Merge {
+    held: BinaryHeap<Reverse<Entry>>,
+    bytes: usize,
+}
 
 impl Merge {
     pub(super) fn push(&mut self, entry: Entry) {
-        self.0.push(Reverse(entry));
+        self.bytes += entry.bytes();
+        self.held.push(Reverse(entry));
+    }
+
+    /// Returns whether some lines must be released before all nodes were read up to them.
+    pub(super) fn is_full(&self) -> bool {
+        self.held.len() > HELD_MAX || self.bytes > HELD_BYTES_MAX
     }
 
     /// Removes the entries up to this time, oldest first. All nodes must have been read up to it.
     pub(super) fn release(&mut self, until_ns: u64) -> Vec<Entry> {
         let mut released = Vec::new();
-        while let Some(Reverse(oldest)) = self.0.peek()
-            && (oldest.at_ns <= until_ns || self.0.len() > HELD_MAX)
+        while let Some(Reverse(oldest)) = self.held.peek()
+            && (oldest.at_ns <= until_ns || self.is_full())
+            && let Some(Reverse(entry)) = self.held.pop()
         {
-            released.extend(self.0.pop().map(|Reverse(entry)| entry));
+            self.bytes -= entry.bytes();
+            released.push(entry);
         }
         released
     }
@@ -89,6 +111,23 @@ mod tests {
         let released = merge.release(5);
         assert!(matches!(released[0].content, Content::Lost(2)), "{released:?}");
         assert!(matches!(released[1].content, Content::Line { .. }), "{released:?}");
+    }
+
+    #[test]
+    fn long_waiting_lines_are_bounded_in_bytes() {
+        let mut merge = Merge::default();
+        let long = |number| {
+            let [level, target] = ["info", "sinew::node"].map(str::to_owned);
+            let text = "x".repeat(HELD_BYTES_MAX / 4);
+            Entry { content: Content::Line { level, target, text }, ..line(100 + number, HIP, number) }
+        };
+        (1..=3).for_each(|number| merge.push(long(number)));
+        assert!(!merge.is_full() && merge.release(0).is_empty());
+        (4..=5).for_each(|number| merge.push(long(number)));
+        assert!(merge.is_full());
+        assert_eq!(keys(&merge.release(0)), [(101, HIP, 1), (102, HIP, 2)]);
+        assert!(!merge.is_full());
+        assert_eq!((merge.release(u64::MAX).len(), merge.bytes), (3, 0));
     }
 
     #[test]

@@ -2,6 +2,8 @@
 
 /// Maximum length of a filter, in characters.
 const FILTER_MAX: usize = 64;
+/// Columns by which one key moves the tables sideways.
+const STEP: usize = 8;
 
 /// A key that has a meaning.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -9,6 +11,8 @@ pub(super) enum Key {
     Char(char),
     Up,
     Down,
+    Left,
+    Right,
     PageUp,
     PageDown,
     Home,
@@ -30,13 +34,19 @@ pub(super) struct Controls {
     pub(super) is_over: bool,
     /// The first visible line.
     scroll: usize,
+    /// The first visible column.
+    left: usize,
 }
 
-/// The lines of the tables, and how many of them are visible.
+/// The size of the tables, and how much of it is visible.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Extent {
     pub(super) lines: usize,
     pub(super) visible: usize,
+    /// Columns of the longest line.
+    pub(super) columns: usize,
+    /// Columns of the terminal.
+    pub(super) width: usize,
 }
 
 impl Extent {
@@ -51,6 +61,8 @@ impl Controls {
             Key::Interrupt => self.is_over = true,
             Key::Up => self.scroll = self.scroll(extent).saturating_sub(1),
             Key::Down => self.scroll += 1,
+            Key::Left => self.left = self.left(extent).saturating_sub(STEP),
+            Key::Right => self.left += STEP,
             Key::PageUp => self.scroll = self.scroll(extent).saturating_sub(extent.visible),
             Key::PageDown => self.scroll += extent.visible,
             Key::Home => self.scroll = 0,
@@ -64,12 +76,17 @@ impl Controls {
             Key::Char('/') => (self.is_typing, self.filter) = (true, String::new()),
             Key::Char(_) | Key::Backspace => {}
         }
-        self.scroll = self.scroll(extent);
+        (self.scroll, self.left) = (self.scroll(extent), self.left(extent));
     }
 
     /// Returns the first visible line: the tables may have become shorter.
     pub(super) fn scroll(&self, extent: Extent) -> usize {
         self.scroll.min(extent.scroll_max())
+    }
+
+    /// Returns the first visible column: the tables may have become narrower.
+    pub(super) fn left(&self, extent: Extent) -> usize {
+        self.left.min(extent.columns.saturating_sub(extent.width))
     }
 
     fn type_sign(&mut self, sign: char) {
@@ -83,7 +100,7 @@ impl Controls {
 mod tests {
     use super::*;
 
-    const EXTENT: Extent = Extent { lines: 30, visible: 10 };
+    const EXTENT: Extent = Extent { lines: 30, visible: 10, columns: 100, width: 80 };
 
     fn pressed(keys: &[Key]) -> Controls {
         let mut controls = Controls::default();
@@ -107,8 +124,18 @@ mod tests {
         assert_eq!(pressed(&[Key::End, Key::PageUp]).scroll(EXTENT), 10);
         assert_eq!(pressed(&[Key::End, Key::Home]).scroll(EXTENT), 0);
         // When: the tables become shorter
-        assert_eq!(pressed(&[Key::End]).scroll(Extent { lines: 12, visible: 10 }), 2);
-        assert_eq!(pressed(&[Key::End]).scroll(Extent { lines: 3, visible: 10 }), 0);
+        assert_eq!(pressed(&[Key::End]).scroll(Extent { lines: 12, ..EXTENT }), 2);
+        assert_eq!(pressed(&[Key::End]).scroll(Extent { lines: 3, ..EXTENT }), 0);
+    }
+
+    #[test]
+    fn narrow_terminal_shows_all_columns_in_turn() {
+        assert_eq!(pressed(&[Key::Left]).left(EXTENT), 0);
+        assert_eq!(pressed(&[Key::Right, Key::Right, Key::Left]).left(EXTENT), STEP);
+        // The last column is at the right edge.
+        assert_eq!(pressed(&[Key::Right; 5]).left(EXTENT), 20);
+        // When: the terminal becomes wide enough
+        assert_eq!(pressed(&[Key::Right]).left(Extent { width: 120, ..EXTENT }), 0);
     }
 
     #[test]

@@ -7,10 +7,14 @@ use sinew::{
     AppAddress, Class, NodeAddress,
     audit::{Account, NodeAudit, Place},
     inspect::{AppReport, GuardReport, LinkReport, LostReport, NodeReport, PeerReport},
+    stop::StopState,
 };
 use sinew_view::{Answers, NodeAnswers, Snapshot};
 
-use crate::table::{clean, time};
+use crate::{
+    stop,
+    table::{clean, time},
+};
 
 /// A column: its heading, and its key in JSON. The unit of a number is in the key.
 type Column = (&'static str, &'static str);
@@ -19,6 +23,7 @@ const NODES: &[Column] = &[
     ("NODE", "name"),
     ("ADDRESS", "address"),
     ("STATE", "state"),
+    ("STOP", "stop"),
     ("UP", "up_us"),
     ("PRIORITY", "priority"),
     ("LATE P99", "late_p99_us"),
@@ -184,7 +189,7 @@ impl Model {
         Value::Object(all)
     }
 
-    /// Returns whether each node answers, and no link is down.
+    /// Returns whether each node answers and is not stopped, and no link is down.
     pub(super) fn is_fine(&self) -> bool {
         let is_shown = |section: &&Section| ["nodes", "links"].contains(&section.key);
         let mut rows = self.sections.iter().filter(is_shown).flat_map(|section| &section.rows);
@@ -249,6 +254,7 @@ fn node_row(node: &NodeAnswers) -> Row {
         name,
         address,
         text(state),
+        report.stop.map_or(Cell::Unknown, |state| text(stop::state(Some(state)))),
         Cell::Time(report.up_us),
         Cell::count(measured.map(|found| found.granted.into())),
         Cell::time(measured.map(|found| found.p99_ns / 1_000)),
@@ -256,7 +262,9 @@ fn node_row(node: &NodeAnswers) -> Row {
         Cell::count(report.own_stalls.map(|stalls| stalls.count)),
         Cell::time(report.own_stalls.filter(|stalls| stalls.count > 0).map(|stalls| stalls.longest_us)),
     ];
-    Row { cells, is_fine }
+    // A node of an older version does not know the stop.
+    let is_released = report.stop.is_none_or(|state| state == StopState::Released);
+    Row { cells, is_fine: is_fine && is_released }
 }
 
 fn app_rows(pairs: &[Pair<'_>], snapshot: &Snapshot) -> Vec<Row> {

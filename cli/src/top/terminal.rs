@@ -19,6 +19,7 @@ use ratatui::{
     widgets::Paragraph,
 };
 use sinew_view::{Snapshot, Source as _};
+use unicode_width::UnicodeWidthStr as _;
 
 use super::{
     controls::{Controls, Extent, Key},
@@ -47,7 +48,8 @@ pub(super) fn run(nodes: Nodes, first: Snapshot) -> io::Result<()> {
     let (path, paused) = (nodes.path(), is_paused.clone());
     // It ends with the process, where no snapshot is wanted.
     std::thread::Builder::new().name("snapshots".to_owned()).spawn(move || sample(&nodes, &put, &paused))?;
-    let mut terminal = ratatui::try_init()?;
+    // A part of it may have been done.
+    let mut terminal = ratatui::try_init().inspect_err(|_| _ = ratatui::try_restore())?;
     let model = Model::of(None, &first);
     let screen = Screen { path, model, last: first, controls: Controls::default(), is_paused };
     let end = screen.show(&mut terminal, &snapshots, &stop);
@@ -81,33 +83,37 @@ impl Screen {
         snapshots: &Receiver<Snapshot>,
         stop: &StopRequest,
     ) -> io::Result<()> {
+        let mut extent = self.draw(terminal)?;
         while !self.controls.is_over && !stop.is_there() {
-            match snapshots.try_recv() {
-                // One that was under way when the screen was paused is not shown.
-                Ok(next) if !self.controls.is_paused => {
-                    self.model = Model::of(Some(&self.last), &next);
-                    self.last = next;
-                }
-                Ok(_) | Err(TryRecvError::Empty) => {}
-                Err(TryRecvError::Disconnected) => {
-                    return Err(io::Error::other(
-                        "the thread that asks the nodes has panicked; report it, please",
-                    ));
-                }
+            let has_new = self.take(snapshots)?;
+            if self.read_keys(extent)? || has_new {
+                extent = self.draw(terminal)?;
             }
-            let shown = lines(&self.model, &self.controls.filter);
-            let visible = terminal.size()?.height.saturating_sub(OWN_LINES);
-            let extent = Extent { lines: shown.len(), visible: visible.into() };
-            terminal.draw(|frame| self.draw(frame, &shown, extent))?;
-            self.read_keys(extent)?;
         }
         Ok(())
     }
 
-    fn read_keys(&mut self, extent: Extent) -> io::Result<()> {
-        let mut within = KEYS_WITHIN;
+    /// Takes the next snapshot. Returns whether there is one to be shown.
+    fn take(&mut self, snapshots: &Receiver<Snapshot>) -> io::Result<bool> {
+        match snapshots.try_recv() {
+            // One that was under way when the screen was paused is not shown.
+            Ok(next) if !self.controls.is_paused => {
+                self.model = Model::of(Some(&self.last), &next);
+                self.last = next;
+                Ok(true)
+            }
+            Ok(_) | Err(TryRecvError::Empty) => Ok(false),
+            Err(TryRecvError::Disconnected) => {
+                Err(io::Error::other("the thread that asks the nodes has panicked; report it, please"))
+            }
+        }
+    }
+
+    /// Handles the keys that wait. Returns whether the screen may have changed, also in its size.
+    fn read_keys(&mut self, extent: Extent) -> io::Result<bool> {
+        let mut has_any = false;
         for _ in 0..KEYS_MAX {
-            if !event::poll(within)? {
+            if !event::poll(if has_any { Duration::ZERO } else { KEYS_WITHIN })? {
                 break;
             }
             if let Event::Key(pressed) = event::read()?
@@ -115,36 +121,49 @@ impl Screen {
             {
                 self.controls.press(key, extent);
             }
-            within = Duration::ZERO;
+            has_any = true;
         }
         self.is_paused.store(self.controls.is_paused, Ordering::Relaxed);
-        Ok(())
+        Ok(has_any)
     }
 
-    fn draw(&self, frame: &mut Frame<'_>, shown: &[Line], extent: Extent) {
+    fn draw(&self, terminal: &mut DefaultTerminal) -> io::Result<Extent> {
+        let shown = lines(&self.model, &self.controls.filter);
+        let size = terminal.size()?;
+        let extent = Extent {
+            lines: shown.len(),
+            visible: size.height.saturating_sub(OWN_LINES).into(),
+            columns: shown.iter().map(|line| line.text.width()).max().unwrap_or(0),
+            width: size.width.into(),
+        };
+        terminal.draw(|frame| self.render(frame, &shown, extent))?;
+        Ok(extent)
+    }
+
+    fn render(&self, frame: &mut Frame<'_>, shown: &[Line], extent: Extent) {
         let rows = [Constraint::Length(1), Constraint::Min(0), Constraint::Length(1)];
         let [head, body, foot] = Layout::vertical(rows).areas(frame.area());
         frame.render_widget(Paragraph::new(self.head()), head);
-        let first = self.controls.scroll(extent);
-        let visible = shown.iter().skip(first).take(extent.visible);
-        frame.render_widget(Paragraph::new(visible.map(styled).collect::<Vec<_>>()), body);
+        let visible = shown.iter().skip(self.controls.scroll(extent)).take(extent.visible);
+        let left = u16::try_from(self.controls.left(extent)).unwrap_or(u16::MAX);
+        let tables = Paragraph::new(visible.map(styled).collect::<Vec<_>>()).scroll((0, left));
+        frame.render_widget(tables, body);
         frame.render_widget(Paragraph::new(self.foot()), foot);
     }
 
+    /// Returns the first line, its most important parts first: a narrow terminal cuts the others off.
     fn head(&self) -> Styled<'static> {
-        let mut spans = vec![
-            Span::styled("sinew top", Modifier::BOLD),
-            Span::raw(format!("  through {}", clean(&self.path))),
-        ];
+        let mut spans = vec![Span::styled("sinew top", Modifier::BOLD)];
         if self.controls.is_paused {
             spans.push(Span::styled("  PAUSED", Modifier::REVERSED));
-        }
-        if self.model.left_out > 0 {
-            spans.push(Span::raw(format!("  {} further nodes", self.model.left_out)));
         }
         if let Some(why) = &self.model.fault {
             spans.push(Span::styled(format!("  its node does not answer: {}", clean(why)), Color::Red));
         }
+        if self.model.left_out > 0 {
+            spans.push(Span::raw(format!("  {} further nodes", self.model.left_out)));
+        }
+        spans.push(Span::raw(format!("  through {}", clean(&self.path))));
         Styled::from(spans)
     }
 
@@ -158,7 +177,7 @@ impl Screen {
         } else {
             format!("   only rows with `{filter}`, Esc shows all")
         };
-        Styled::from(format!("q end   arrows, PgUp, PgDn scroll   / filter   p pause{filter}"))
+        Styled::from(format!("q end   / filter   p pause   arrows, PgUp, PgDn scroll{filter}"))
     }
 }
 
@@ -184,6 +203,8 @@ fn key(pressed: KeyEvent) -> Option<Key> {
         KeyCode::Char(sign) if !is_control => Some(Key::Char(sign)),
         KeyCode::Up => Some(Key::Up),
         KeyCode::Down => Some(Key::Down),
+        KeyCode::Left => Some(Key::Left),
+        KeyCode::Right => Some(Key::Right),
         KeyCode::PageUp => Some(Key::PageUp),
         KeyCode::PageDown => Some(Key::PageDown),
         KeyCode::Home => Some(Key::Home),

@@ -29,8 +29,6 @@ const RESOLVED_EVERY: Duration = Duration::from_secs(2);
 const WATCHED_EVERY: Duration = Duration::from_millis(50);
 /// Questions to such a node in a row, while it has more.
 const WATCHED_MAX: usize = 8;
-/// Messages to all applications that are dropped at once.
-const DISCARDED_MAX: usize = 256;
 /// Time limit for each question: meanwhile nothing else is read.
 const ASKED_WITHIN: Duration = Duration::from_millis(500);
 
@@ -73,7 +71,7 @@ impl Drop for Own {
 
 impl Connection for Own {
     fn ask(&mut self, question: &AskRecord, within: Duration) -> Result<RecordReport, String> {
-        discard(&mut self.system);
+        self.system.discard();
         let to = Tid::new(self.node(), AppAddress::INSPECT);
         self.system.endpoint.message(to, question).ask(within).map_err(|error| in_words(&error))
     }
@@ -119,7 +117,7 @@ impl Messages {
             Some(system) => system,
             None => self.entry.enter(self.within)?,
         };
-        discard(&mut system);
+        system.discard();
         if let Err(why) = self.find(&mut system) {
             self.entry.leave(system);
             return Err(why);
@@ -266,15 +264,6 @@ impl Drop for Messages {
         }
         if let Some(system) = self.system.take() {
             self.entry.leave(system);
-        }
-    }
-}
-
-/// Reads and drops messages to all applications: a node reports clients that do not read.
-fn discard(system: &mut System) {
-    for _ in 0..DISCARDED_MAX {
-        if !matches!(system.endpoint.receive(Duration::ZERO), Ok(Some(_))) {
-            return;
         }
     }
 }

@@ -22,6 +22,13 @@ fn is_start_of(line: &Value, node: &str) -> bool {
         && line["text"].as_str().is_some_and(|text| text.contains(STARTED))
 }
 
+/// Follows the lines of all nodes through this one.
+fn follow(scenario: &Scenario, here: &str) -> NodeProcess {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_sinew"));
+    command.arg("--socket").arg(scenario.socket(here)).args(["logs", "--follow", "--json"]);
+    NodeProcess::start("sinew logs", command)
+}
+
 #[test]
 fn lines_of_all_nodes_are_merged_by_time() {
     // Given: the knee has started after the hip
@@ -60,9 +67,7 @@ fn followed_lines_survive_the_restart_of_a_node() {
     // Given: the lines of the hip are followed
     let scenario = Scenario::new();
     let _hip = scenario.start("hip", 1, &[]);
-    let mut command = Command::new(env!("CARGO_BIN_EXE_sinew"));
-    command.arg("--socket").arg(scenario.socket("hip")).args(["logs", "--follow", "--json"]);
-    let mut logs = NodeProcess::start("sinew logs", command);
+    let mut logs = follow(&scenario, "hip");
     logs.wait_for(&["\"node\":\"hip\"", STARTED]);
     // When: a node starts, is killed, and starts again
     let mut knee = scenario.start("knee", 2, &[]);
@@ -76,6 +81,24 @@ fn followed_lines_survive_the_restart_of_a_node() {
     let is_silent = |line: &&String| line.contains("\"event\":\"silent\"");
     assert_eq!(logs.output().iter().filter(is_silent).count(), 1, "{:?}", logs.output());
     // And: Ctrl-C ends it in order
+    logs.signal(Signal::INT);
+    assert_eq!(logs.wait_for_exit(), Some(0));
+}
+
+#[test]
+fn followed_lines_survive_the_restart_of_the_entry_node() {
+    // Given: the lines of a node are followed through it
+    let scenario = Scenario::new();
+    let mut knee = scenario.start("knee", 2, &[]);
+    let mut logs = follow(&scenario, "knee");
+    logs.wait_for(&["\"node\":\"knee\"", STARTED]);
+    // When: it is killed, and starts again
+    assert!(knee.kill());
+    logs.wait_for(&["\"event\":\"silent\"", "knee"]);
+    let _knee = scenario.start("knee", 2, &[]);
+    // Then: its new lines are shown
+    logs.wait_for(&["\"event\":\"answers\"", "knee"]);
+    logs.wait_for(&["\"node\":\"knee\"", STARTED]);
     logs.signal(Signal::INT);
     assert_eq!(logs.wait_for_exit(), Some(0));
 }

@@ -78,7 +78,8 @@ fn table_is_printed_once_without_a_terminal() {
         let links = json["links"].as_array().map_or(&[][..], Vec::as_slice);
         let is_out =
             |row: &&serde_json::Value| row["from"] == "hip" && row["to"] == "knee" && row["class"] == "bulk";
-        named(&json["apps"], "knee").is_some_and(|app| has_rate(app, "in_per_s"))
+        named(&json["nodes"], "hip").is_some_and(|node| node["stop"] == "released")
+            && named(&json["apps"], "knee").is_some_and(|app| has_rate(app, "in_per_s"))
             && links.iter().find(is_out).is_some_and(|row| row["state"] == "up" && has_rate(row, "out_per_s"))
     });
     let knee = named(&json["apps"], "knee").expect("it is there");
@@ -131,6 +132,15 @@ fn screen_shows_rates_and_handles_keys() {
         .until("the screen is small", |screen| is_title(screen) && !screen.contains("Losses of messages"));
     terminal.press("Down");
     terminal.until("the first line is scrolled away", |screen| !is_title(screen));
+    // A narrow one has the first columns, and the arrows show the others.
+    terminal.tmux(&["resize-window", "-x", "40", "-y", "8"]);
+    terminal.until("the last column is cut off", |screen| {
+        has_line(screen, &["NODE", "STATE"]) && !screen.contains("LONGEST")
+    });
+    for _ in 0..7 {
+        terminal.press("Right");
+    }
+    terminal.until("the last column is shown", |screen| screen.contains("LONGEST"));
     // And: q gives the terminal back
     terminal.press("q");
     terminal.until("it has ended in order", |screen| has_line(screen, &["exit code 0"]));

@@ -87,6 +87,7 @@ fn hip(seconds: u64) -> Answers {
         own_stalls: Some(StallReport { count: 2, longest_us: 300_000, last_us: Some(1) }),
         real_time: Some(real_time),
         peers: vec![peer],
+        stop: Some(StopState::Released),
         ..node_report("hip", 7, None)
     };
     let audit = NodeAudit {
@@ -130,15 +131,18 @@ fn rows(model: &Model, title: &str) -> Vec<Vec<String>> {
     section.rows.iter().map(Row::texts).collect()
 }
 
+fn row<const N: usize>(cells: [&str; N]) -> Vec<String> {
+    cells.map(str::to_owned).to_vec()
+}
+
 #[test]
 fn tables_have_states_queues_and_rates() {
     let model = Model::of(Some(&snapshot(hip(10))), &snapshot(hip(12)));
-    let row = |cells: [&str; 9]| cells.map(str::to_owned).to_vec();
     assert_eq!(
         rows(&model, "Nodes"),
         [
-            row(["hip", "192.168.0.7", "up", "12.0 s", "60", "60 us", "210 us", "2", "300.0 ms"]),
-            row(["knee", "192.168.0.8", "no answer", "-", "-", "-", "-", "-", "-"]),
+            row(["hip", "192.168.0.7", "up", "released", "12.0 s", "60", "60 us", "210 us", "2", "300.0 ms"]),
+            row(["knee", "192.168.0.8", "no answer", "-", "-", "-", "-", "-", "-", "-"]),
         ]
     );
     // This command itself is not shown.
@@ -185,6 +189,22 @@ fn worst_state_of_the_outputs_is_shown() {
     assert_eq!(shown(&[of(None, false)]), text("live", true));
     assert_eq!(shown(&[of(None, false), of(Some("Silent"), false)]), text("safe: Silent", false));
     assert_eq!(shown(&[of(Some("Silent"), false), of(None, true)]), text("FAILED", false));
+}
+
+#[test]
+fn node_is_fine_unless_it_is_stopped() {
+    let of = |stop| {
+        let mut hip = hip(12);
+        hip.node.stop = stop;
+        let node = NodeAnswers { node: HIP, name: "hip".to_owned(), result: Ok(Box::new(hip)) };
+        let row = node_row(&node);
+        (row.texts()[3].clone(), row.is_fine)
+    };
+    let shown = |word: &str, is_fine| (word.to_owned(), is_fine);
+    assert_eq!(of(Some(StopState::Released)), shown("released", true));
+    assert_eq!(of(Some(StopState::Stopped)), shown("stopped", false));
+    assert_eq!(of(Some(StopState::Held)), shown("held", false));
+    assert_eq!(of(None), shown("-", true));
 }
 
 #[test]
