@@ -343,7 +343,7 @@ mod tests {
     }
 
     #[test]
-    fn receipts_behind_a_panic_or_left_by_the_sink_say_failed() {
+    fn receipts_left_by_a_sink_say_failed() {
         #[derive(Default)]
         struct TakesOne {
             panics: bool,

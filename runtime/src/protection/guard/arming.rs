@@ -44,9 +44,10 @@ impl<O: Send + 'static> Guard<O> {
 
     /// Acknowledges that a stop was pressed and released: from now on the output can be armed again. It moves nothing.
     ///
-    /// Call it on the order of a person, or of the application that coordinates the start. An application that calls it
-    /// by itself, as soon as the stop is released, makes the robot move by the release. The outputs that the application
-    /// makes later are acknowledged by it, too; without it they cannot be armed, even if they were made after the release.
+    /// Call it on the order of a person, or of the application that coordinates the start. An application that
+    /// calls it by itself, as soon as the stop is released, makes the robot move by the release. The outputs that
+    /// the application makes later are acknowledged by it, too; without it they cannot be armed, even if they were
+    /// made after the release.
     ///
     /// # Errors
     /// The stop is still in force ([`ArmError::Stopped`]), or the output could not be made safe.

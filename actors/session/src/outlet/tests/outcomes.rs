@@ -174,7 +174,7 @@ fn outcomes_of_consecutive_messages_wait_as_one() {
 }
 
 #[test]
-fn run_is_one_entry_for_a_peer_that_accepts_runs() {
+fn run_is_one_entry_for_peers_with_runs() {
     for (frame, bytes) in FRAMES.into_iter().zip([100 * 17, 2 * 18]) {
         let bench = bench(Some(frame), usize::MAX);
         for correlation in (1..=40).chain(42..=101) {
