@@ -14,7 +14,7 @@ export const STEP_MS = 60_000;
 const END_MS = 10_000;
 const LOOK_MS = 50;
 
-const programs = process.env.SINEW_PROGRAMS ?? resolve(dirname(fileURLToPath(import.meta.url)), "../../target/debug");
+const programs = resolve(process.env.SINEW_PROGRAMS ?? join(dirname(fileURLToPath(import.meta.url)), "../../target/debug"));
 const chromium = process.env.CHROMIUM ?? "/usr/bin/chromium";
 
 let failures = 0;
