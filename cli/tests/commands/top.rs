@@ -147,13 +147,19 @@ fn screen_shows_rates_and_handles_keys() {
 }
 
 #[test]
-fn followed_log_ends_with_interrupt() {
+fn followed_log_shows_new_lines_until_interrupt() {
     let scenario = Scenario::new();
     let _knee = scenario.start("knee", 2, &[]);
     let Some(terminal) = Terminal::start(&scenario, "knee", &["logs", "-f"]) else { return };
     terminal.until("the start of the knee is shown", |screen| {
         has_line(screen, &["INFO knee", "the node has started"])
     });
+    // When: another node starts
+    let _hip = scenario.start("hip", 1, &[]);
+    terminal.until("the start of the hip is shown", |screen| {
+        has_line(screen, &["INFO hip", "the node has started"])
+    });
+    // And: Ctrl-C gives the terminal back
     terminal.press("C-c");
     terminal.until("it has ended in order", |screen| has_line(screen, &["exit code 0"]));
 }

@@ -300,12 +300,19 @@ fn scrape_passes_the_linter_of_prometheus() {
         return;
     }
     let scenario = Scenario::new();
-    let (_hip, _knee) = scenario.start_a_hip_that_sends_to_a_knee();
+    let (_hip, mut knee) = scenario.start_a_hip_that_sends_to_a_knee();
     let view = View::of(&scenario, "hip");
-    let text = scenario.directory.write("metrics.txt", &view.get("/metrics", "Accept: text/plain\r\n").body);
-    let input = std::fs::File::open(text).expect("it was written");
-    let answer = Answer::of(Command::new("promtool").args(["check", "metrics"]).stdin(input));
-    assert_eq!(answer.code, Some(0), "{}{}", answer.out, answer.err);
+    let lint = |when: &str| {
+        let text = view.get("/metrics", "Accept: text/plain\r\n").body;
+        let input =
+            std::fs::File::open(scenario.directory.write("metrics.txt", &text)).expect("it was written");
+        let answer = Answer::of(Command::new("promtool").args(["check", "metrics"]).stdin(input));
+        assert_eq!(answer.code, Some(0), "{when}: {}{}\n{text}", answer.out, answer.err);
+    };
+    lint("both nodes run");
+    assert!(knee.kill());
+    view.until("the knee is lost", |metrics| metrics.is("sinew_node_up{node=\"knee\"}", 0.0));
+    lint("a node is lost");
     let rules = concat!(env!("CARGO_MANIFEST_DIR"), "/../view/alerts.yml");
     let answer = Answer::of(Command::new("promtool").args(["check", "rules", rules]));
     assert_eq!(answer.code, Some(0), "{}{}", answer.out, answer.err);
