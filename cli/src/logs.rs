@@ -95,8 +95,7 @@ pub(crate) fn show(system: &mut System, order: &Order, is_json: bool) -> Result<
     }
     let mut nodes_due = began + NODES_PERIOD;
     let is_over = || stop.as_ref().is_some_and(StopRequest::is_there);
-    loop {
-        let Some(has_more) = reader.round(system, &is_over) else { break };
+    while let Some(has_more) = reader.round(system, &is_over) {
         system.discard();
         let is_last = is_over() || !(order.follow || has_more);
         if !reader.print(is_last) || is_last {
