@@ -103,6 +103,16 @@
 #define SINEW_PHASE 2
 
 /**
+ * For the times of `sinew_stop_node`: there is none.
+ */
+#define SINEW_STOP_NO_TIME UINT64_MAX
+
+/**
+ * Bytes of a node's name in `sinew_stop_node`, with its zero.
+ */
+#define SINEW_STOP_NAME 64
+
+/**
  * For `events` of `sinew_options`: `sinew.node_event`, nodes that are found, lost, restarted.
  */
 #define SINEW_NODE_EVENTS 1
@@ -592,6 +602,40 @@ typedef uint32_t sinew_field_type;
 #endif // __cplusplus
 
 /**
+ * Whether a node is stopped.
+ */
+enum sinew_stop_state
+#if defined(__cplusplus) || __STDC_VERSION__ >= 202311L
+  : int32_t
+#endif // defined(__cplusplus) || __STDC_VERSION__ >= 202311L
+ {
+    /**
+     * Nothing was received from the node.
+     */
+    SINEW_STOP_UNKNOWN = 0,
+    /**
+     * Outputs may be armed.
+     */
+    SINEW_STOP_RELEASED = 1,
+    /**
+     * No press is known. Outputs stay as they are and cannot be armed: the node does not know yet whether
+     * the others are stopped.
+     */
+    SINEW_STOP_HELD = 2,
+    /**
+     * A stop is in force.
+     */
+    SINEW_STOP_STOPPED = 3,
+};
+#ifndef __cplusplus
+#if __STDC_VERSION__ >= 202311L
+typedef enum sinew_stop_state sinew_stop_state;
+#else
+typedef int32_t sinew_stop_state;
+#endif // __STDC_VERSION__ >= 202311L
+#endif // __cplusplus
+
+/**
  * An endpoint: a transport address of this process. Programs have only pointers to it.
  */
 typedef struct sinew_endpoint sinew_endpoint;
@@ -969,6 +1013,64 @@ typedef struct sinew_barrier {
      */
     uint32_t reserved;
 } sinew_barrier;
+
+/**
+ * One node's part in the stop.
+ */
+typedef struct sinew_stop_node {
+    /**
+     * The address of its stop, which has the node.
+     */
+    sinew_tid tid;
+    /**
+     * Time from the newest press until the confirmation was there; `SINEW_STOP_NO_TIME`: the node has not
+     * confirmed, and may still move.
+     */
+    uint64_t confirmed_ns;
+    /**
+     * Time after the press within which the node's own watchdogs make its outputs safe although it has not
+     * confirmed; `SINEW_STOP_NO_TIME`: no such time is known.
+     */
+    uint64_t bound_ns;
+    /**
+     * One of `sinew_stop_state`.
+     */
+    int32_t state;
+    /**
+     * Number of guarded outputs in its process.
+     */
+    uint32_t outputs;
+    /**
+     * Its name, of which the first bytes are kept, terminated by a zero.
+     */
+    char name[SINEW_STOP_NAME];
+} sinew_stop_node;
+
+/**
+ * The state of the stop, as the endpoint's node knows it.
+ */
+typedef struct sinew_stop_report {
+    /**
+     * Number of nodes, the endpoint's own first; may be above the capacity that was given.
+     */
+    size_t nodes;
+    /**
+     * Number of presses that are not released.
+     */
+    size_t presses;
+    /**
+     * State of the endpoint's node: one of `sinew_stop_state`.
+     */
+    int32_t state;
+    /**
+     * Whether the system is stopped and every known node has confirmed that its outputs are safe.
+     */
+    bool is_confirmed;
+    /**
+     * Zeros.
+     */
+    uint8_t reserved[3];
+} sinew_stop_report;
 
 /**
  * A type of protected payloads: its name, and the limits of the receiver. Both ends use the same one, best
@@ -1455,6 +1557,43 @@ sinew_status sinew_decode_value(const struct sinew_payload_type *payload_type,
 sinew_status sinew_meet(struct sinew_endpoint *endpoint,
                         const struct sinew_barrier *barrier,
                         uint64_t *generation);
+
+/**
+ * Presses the stop of the whole system: every guarded output of every node becomes safe, and stays so until
+ * an operator has released the stop, and each application has acknowledged it and armed its output again. It
+ * is no safety function.
+ *
+ * Returns when all nodes have confirmed, and after `within_ns` at the latest, which counts as 60 s at most.
+ * Then the first `capacity` nodes are in `nodes`, which may be NULL, and the state is in `*report`, which may
+ * be NULL. Look at `is_confirmed`: `SINEW_OK` says only that the node has answered. A `reason` that cannot be
+ * read is replaced, so that a wrong argument hinders no press. After an error the stop may be pressed; try
+ * again, and cut the power. `SINEW_ERROR_LOAN_ACTIVE` and `SINEW_ERROR_BUSY`: it was not pressed; a button
+ * has an endpoint of its own. The endpoint's thread.
+ */
+sinew_status sinew_press_stop(struct sinew_endpoint *endpoint,
+                              struct sinew_text reason,
+                              uint64_t within_ns,
+                              struct sinew_stop_node *nodes,
+                              size_t capacity,
+                              struct sinew_stop_report *report);
+
+/**
+ * Asks the endpoint's node for the state of the stop, and waits at most for `within_ns`. The results are
+ * those of `sinew_press_stop`. The endpoint's thread.
+ */
+sinew_status sinew_ask_stop(struct sinew_endpoint *endpoint,
+                            uint64_t within_ns,
+                            struct sinew_stop_node *nodes,
+                            size_t capacity,
+                            struct sinew_stop_report *report);
+
+/**
+ * Acknowledges a stop that is released, and waits at most for `within_ns`: before that the outputs of this
+ * endpoint cannot be armed, as its node hands over none of its echoes. Call it on the order of a person, or
+ * of the application that coordinates the start. It moves nothing. `SINEW_ERROR_NOT_HANDLED`: a stop is in
+ * force. The endpoint's thread.
+ */
+sinew_status sinew_acknowledge_stop(struct sinew_endpoint *endpoint, uint64_t within_ns);
 
 /**
  * Gives a type of protected payloads, for a message each `period_ns`: two may be late or missing, one in 64
