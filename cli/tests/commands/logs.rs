@@ -9,6 +9,8 @@ use sinew_testkit::NodeProcess;
 use crate::scenario::{Answer, Scenario, sinew};
 
 const STARTED: &str = "the node has started";
+/// A program without a subscriber of its own, as a first program is: such a subscriber decides which lines there are.
+pub(crate) const PLAIN: &[&str] = &["--default-log"];
 
 /// Returns the lines of an answer in JSON.
 fn lines(answer: &Answer) -> Vec<Value> {
@@ -33,8 +35,8 @@ fn follow(scenario: &Scenario, here: &str) -> NodeProcess {
 fn lines_of_all_nodes_are_merged_by_time() {
     // Given: the knee has started after the hip
     let scenario = Scenario::new();
-    let _hip = scenario.start("hip", 1, &[]);
-    let mut knee = scenario.start("knee", 2, &["--requires", "hip"]);
+    let _hip = scenario.start("hip", 1, PLAIN);
+    let mut knee = scenario.start("knee", 2, &["--default-log", "--requires", "hip"]);
     knee.wait_for(&["started"]);
     for here in ["hip", "knee"] {
         // When
@@ -66,16 +68,16 @@ fn lines_of_all_nodes_are_merged_by_time() {
 fn followed_lines_survive_the_restart_of_a_node() {
     // Given: the lines of the hip are followed
     let scenario = Scenario::new();
-    let _hip = scenario.start("hip", 1, &[]);
+    let _hip = scenario.start("hip", 1, PLAIN);
     let mut logs = follow(&scenario, "hip");
     logs.wait_for(&["\"node\":\"hip\"", STARTED]);
     // When: a node starts, is killed, and starts again
-    let mut knee = scenario.start("knee", 2, &[]);
+    let mut knee = scenario.start("knee", 2, PLAIN);
     logs.wait_for(&["\"node\":\"knee\"", STARTED]);
     assert!(knee.kill());
     // Then: it is named once, and its new lines are shown
     logs.wait_for(&["\"event\":\"silent\"", "knee"]);
-    let _knee = scenario.start("knee", 2, &[]);
+    let _knee = scenario.start("knee", 2, PLAIN);
     logs.wait_for(&["\"event\":\"answers\"", "knee"]);
     logs.wait_for(&["\"node\":\"knee\"", STARTED]);
     let is_silent = |line: &&String| line.contains("\"event\":\"silent\"");
@@ -89,13 +91,13 @@ fn followed_lines_survive_the_restart_of_a_node() {
 fn followed_lines_survive_the_restart_of_the_entry_node() {
     // Given: the lines of a node are followed through it
     let scenario = Scenario::new();
-    let mut knee = scenario.start("knee", 2, &[]);
+    let mut knee = scenario.start("knee", 2, PLAIN);
     let mut logs = follow(&scenario, "knee");
     logs.wait_for(&["\"node\":\"knee\"", STARTED]);
     // When: it is killed, and starts again
     assert!(knee.kill());
     logs.wait_for(&["\"event\":\"silent\"", "knee"]);
-    let _knee = scenario.start("knee", 2, &[]);
+    let _knee = scenario.start("knee", 2, PLAIN);
     // Then: its new lines are shown
     logs.wait_for(&["\"event\":\"answers\"", "knee"]);
     logs.wait_for(&["\"node\":\"knee\"", STARTED]);
@@ -106,7 +108,7 @@ fn followed_lines_survive_the_restart_of_the_entry_node() {
 #[test]
 fn unknown_nodes_and_levels_are_refused() {
     let scenario = Scenario::new();
-    let _knee = scenario.start("knee", 2, &[]);
+    let _knee = scenario.start("knee", 2, PLAIN);
     let answer = scenario.sinew("knee", &["logs", "--node", "kneee"]);
     let words = "no node is called `kneee` or has this address; nearest: knee (node)";
     assert!(answer.code == Some(1) && answer.err.contains(words), "{}{}", answer.out, answer.err);

@@ -4,7 +4,10 @@ use std::process::{Command, Output};
 
 use sinew_testkit::{unique, until};
 
-use crate::scenario::{Scenario, named};
+use crate::{
+    logs::PLAIN,
+    scenario::{Scenario, named},
+};
 
 /// Columns and lines of the terminal.
 const SIZE: [&str; 4] = ["-x", "130", "-y", "48"];
@@ -149,13 +152,13 @@ fn screen_shows_rates_and_handles_keys() {
 #[test]
 fn followed_log_shows_new_lines_until_interrupt() {
     let scenario = Scenario::new();
-    let _knee = scenario.start("knee", 2, &[]);
+    let _knee = scenario.start("knee", 2, PLAIN);
     let Some(terminal) = Terminal::start(&scenario, "knee", &["logs", "-f"]) else { return };
     terminal.until("the start of the knee is shown", |screen| {
         has_line(screen, &["INFO knee", "the node has started"])
     });
     // When: another node starts
-    let _hip = scenario.start("hip", 1, &[]);
+    let _hip = scenario.start("hip", 1, PLAIN);
     terminal.until("the start of the hip is shown", |screen| {
         has_line(screen, &["INFO hip", "the node has started"])
     });
