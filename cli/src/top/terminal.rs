@@ -42,7 +42,7 @@ const OWN_LINES: u16 = 2;
 /// # Errors
 /// The terminal cannot be set up, drawn on or read, or the system gives no thread.
 pub(super) fn run(nodes: Nodes, first: Snapshot) -> io::Result<()> {
-    let stop = StopRequest::listen()?;
+    let stop = StopRequest::listen_on_terminal()?;
     let is_paused = Arc::new(AtomicBool::new(false));
     let (put, snapshots) = sync_channel(1);
     let (path, paused) = (nodes.path(), is_paused.clone());

@@ -1,6 +1,10 @@
 //! `sinew top` as plain text, and on a terminal.
 
-use std::process::{Command, Output};
+use std::{
+    fs,
+    path::Path,
+    process::{Command, Output},
+};
 
 use sinew_testkit::{unique, until};
 
@@ -165,4 +169,19 @@ fn followed_log_shows_new_lines_until_interrupt() {
     // And: Ctrl-C gives the terminal back
     terminal.press("C-c");
     terminal.until("it has ended in order", |screen| has_line(screen, &["exit code 0"]));
+}
+
+#[test]
+fn terminal_that_closes_ends_the_screen() {
+    let scenario = Scenario::new();
+    let _knee = scenario.start("knee", 2, &[]);
+    let Some(terminal) = Terminal::start(&scenario, "knee", &["top"]) else { return };
+    terminal.until("the screen is shown", |screen| has_line(screen, &["knee", "127.0.0.2"]));
+    let shell = terminal.tmux(&["display-message", "-p", "#{pane_pid}"]).stdout;
+    let shell = String::from_utf8(shell).expect("a number").trim().to_owned();
+    let children =
+        fs::read_to_string(format!("/proc/{shell}/task/{shell}/children")).expect("the shell runs");
+    let command = children.split_whitespace().next().expect("the shell has started the command").to_owned();
+    drop(terminal);
+    until("the command has ended", || (!Path::new("/proc").join(&command).exists()).then_some(()));
 }

@@ -26,6 +26,7 @@ use sinew::{
     message::{Kind, Rejection},
     prelude::*,
     protection::{Cause, DataId, Guard, Protection, State, Tally, open, seal},
+    stop::{AskStop, StopReport, StopState},
 };
 use sinew_testkit::{DEADLINE, Loopback, TestDirectory};
 
@@ -164,6 +165,15 @@ fn relay(name: &str, own: Tid, directory: &TestDirectory) -> Endpoint {
     api.register_transport_address(registration).expect("the address is free")
 }
 
+/// Waits until the relay's node knows that no stop is in force: before, it hands over no echo of a client.
+fn await_release(relay: &mut Endpoint) {
+    let stop = Tid::new(relay.tid().node, AppAddress::STOP);
+    sinew_testkit::until("the node is not held", || {
+        let report: StopReport = relay.message(stop, &AskStop {}).ask(DEADLINE).expect("the node answers");
+        (report.state == StopState::Released).then_some(())
+    });
+}
+
 impl<const AGE_MAX_MS: u64> Scene<AGE_MAX_MS> {
     fn start() -> Self {
         let directory = TestDirectory::new();
@@ -191,10 +201,14 @@ impl<const AGE_MAX_MS: u64> Scene<AGE_MAX_MS> {
         sinew_testkit::sees(&nodes[1].handle(), nodes[0].address());
         sinew_testkit::sees(&nodes[2].handle(), nodes[3].address());
         let guard = guard.recv_timeout(DEADLINE).expect("the drive has a guard");
+        let mut to_central = relay("one.relay", drive(), &directory);
+        let mut to_drive = relay("two.relay", central(), &directory);
+        await_release(&mut to_central);
+        await_release(&mut to_drive);
         Self {
-            to_central: relay("one.relay", drive(), &directory),
+            to_central,
             to_central_as_another: relay("one.relay", other_drive(), &directory),
-            to_drive: relay("two.relay", central(), &directory),
+            to_drive,
             guard,
             motor: seen,
             number: 0,
