@@ -116,12 +116,17 @@ impl Screen {
             if !event::poll(if has_any { Duration::ZERO } else { KEYS_WITHIN })? {
                 break;
             }
-            if let Event::Key(pressed) = event::read()?
+            has_any = true;
+            let event = event::read()?;
+            if let Event::Key(pressed) = event
                 && let Some(key) = key(pressed)
             {
                 self.controls.press(key, extent);
             }
-            has_any = true;
+            // The next key counts on a screen of the new size.
+            if matches!(event, Event::Resize(..)) {
+                break;
+            }
         }
         self.is_paused.store(self.controls.is_paused, Ordering::Relaxed);
         Ok(has_any)

@@ -144,10 +144,14 @@ fn screen_shows_rates_and_handles_keys() {
     terminal.until("the last column is cut off", |screen| {
         has_line(screen, &["NODE", "STATE"]) && !screen.contains("LONGEST")
     });
-    for _ in 0..7 {
-        terminal.press("Right");
-    }
-    terminal.until("the last column is shown", |screen| screen.contains("LONGEST"));
+    // A key before the new size does not count.
+    terminal.until("the last column is shown", |screen| {
+        let is_shown = screen.contains("LONGEST");
+        if !is_shown {
+            terminal.press("Right");
+        }
+        is_shown
+    });
     // And: q gives the terminal back
     terminal.press("q");
     terminal.until("it has ended in order", |screen| has_line(screen, &["exit code 0"]));
