@@ -239,10 +239,11 @@ impl<S: Socket> WriterState<S> {
         deferred: &mut DeferredActions,
     ) {
         self.counters.counts.refused -= 1;
+        let Some(room) = room else { return };
         if !confirming_destination(message)
-            .is_some_and(|destination| self.receipts.await_fewer(destination, room))
+            .is_some_and(|destination| self.receipts.await_fewer(destination, room, deferred))
         {
-            deferred.room.extend(room.and_then(|room| self.unsent.queue.offered(message, room)));
+            deferred.room.extend(self.unsent.offered(message, room));
         }
     }
 
@@ -353,7 +354,7 @@ impl<S: Socket> WriterState<S> {
         }
         let had_frame = self.has_frame();
         let Some(effect) = self.numbering.on_ack(ack) else { return false };
-        self.unsent.on_held(ack);
+        deferred.room.extend(self.unsent.on_held(ack));
         // A frame that could be written before has its wake. In a flood another one for each ACK would end its delay.
         if !had_frame && self.has_frame() || !matches!(effect, AckEffect::Known) {
             self.connection.wake_drainer(deferred);
@@ -417,7 +418,7 @@ impl<S: Socket> WriterState<S> {
     /// whether it was queued here.
     pub(super) fn cancel(&mut self, ticket: Ticket, deferred: &mut DeferredActions) -> bool {
         let Some(message) = self.unsent.take_request(ticket) else { return false };
-        deferred.room.extend(self.unsent.queue.room_made());
+        deferred.room.extend(self.unsent.backlog_changed());
         self.receipts.remove_waiting(confirming_destination(&message));
         self.expired(message, deferred);
         true
@@ -425,7 +426,11 @@ impl<S: Socket> WriterState<S> {
 
     /// Returns whether any message is left that can expire, or any outcome that can become overdue.
     pub(super) fn expire(&mut self, now: Time, deferred: &mut DeferredActions) -> bool {
-        for message in self.unsent.take_expired(now) {
+        let expired = self.unsent.take_expired(now);
+        if !expired.is_empty() {
+            deferred.room.extend(self.unsent.backlog_changed());
+        }
+        for message in expired {
             self.receipts.remove_waiting(confirming_destination(&message));
             self.expired(message, deferred);
         }
