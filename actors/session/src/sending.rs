@@ -134,6 +134,11 @@ impl<M> Sending<M> {
         self.cursor.map_or(0, |cursor| (self.end() - cursor) as usize)
     }
 
+    /// Returns the number that [`keep`](Self::keep) gives to the next message.
+    pub fn next_number(&self) -> u64 {
+        self.end()
+    }
+
     /// Keeps a message at the write of its frame of `bytes`, and returns its number. Requires
     /// [room](Self::has_room).
     pub fn keep(&mut self, message: M, bytes: usize) -> u64 {

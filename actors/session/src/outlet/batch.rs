@@ -154,9 +154,13 @@ impl<S: Socket> Socket for Gathering<S> {
         true
     }
 
+    fn gather_room(&self) -> usize {
+        GATHERED_MAX.saturating_sub(self.bytes.len())
+    }
+
     fn gather(&mut self, parts: &[IoSlice<'_>]) -> bool {
         let length: usize = parts.iter().map(|part| part.len()).sum();
-        let has_room = self.bytes.len() + length <= GATHERED_MAX;
+        let has_room = length <= self.gather_room();
         if has_room {
             parts.iter().for_each(|part| self.bytes.extend_from_slice(part));
         }

@@ -127,8 +127,14 @@ impl<S: Socket> WriterState<S> {
     /// Gathers the next frame. If there is none, or no room for it, writes the gathered bytes and then the
     /// next piece of the frame. Returns how many bytes the socket has accepted.
     fn gather_next(&mut self, deferred: &mut DeferredActions) -> usize {
-        let Some(frame) = self.next_frame(deferred) else { return self.connection.write_gathered() };
-        let Err(frame) = self.gather(frame) else { return 0 };
+        let frame = if let Some(frame) = self.next_started() {
+            let Err(frame) = self.gather(frame) else { return 0 };
+            frame
+        } else {
+            let Some(message) = self.next_message(deferred) else { return self.connection.write_gathered() };
+            let Err(message) = self.gather_message(message) else { return 0 };
+            self.frame(message)
+        };
         let taken = self.connection.write_gathered();
         if self.connection.gathered() > 0 {
             self.connection.partial = Some(frame);
@@ -139,6 +145,19 @@ impl<S: Socket> WriterState<S> {
             Ok(()) => taken,
             Err(frame) => taken + self.write_frame(frame),
         }
+    }
+
+    /// Gathers the frame of a message that was never sent, if there is room. In a burst this is nearly every message:
+    /// it is encoded where it is gathered, and the session keeps the message itself.
+    fn gather_message(&mut self, mut message: Message) -> Result<(), Message> {
+        if message.size() > self.connection.gather_room() {
+            return Err(message);
+        }
+        self.counters.numbered += u64::from(self.numbering.assign(&mut message.header));
+        self.connection.gather_message(&message);
+        self.sent_message(&mut message);
+        self.numbering.keep(message);
+        Ok(())
     }
 
     /// Gathers a frame that has not been started, if there is room.
@@ -168,8 +187,17 @@ impl<S: Socket> WriterState<S> {
     }
 
     fn next_frame(&mut self, deferred: &mut DeferredActions) -> Option<Partial> {
-        if let Some(partial) = self.connection.partial.take() {
-            return Some(partial);
+        self.next_started().or_else(|| {
+            let message = self.next_message(deferred)?;
+            Some(self.frame(message))
+        })
+    }
+
+    /// Returns the next frame that precedes all messages that were never sent, or the last one behind them.
+    fn next_started(&mut self) -> Option<Partial> {
+        // Nearly always there is none, which is cheaper to see than to take.
+        if self.connection.partial.is_some() {
+            return self.connection.partial.take();
         }
         if let Some(urgent) = self.link_frames.pop_urgent() {
             return Some(self.link_frame(urgent));
@@ -181,7 +209,12 @@ impl<S: Socket> WriterState<S> {
             let last = if self.is_last_due() { self.link_frames.take_last() } else { None };
             return last.map(|last| self.link_frame(last));
         }
-        if !self.numbering.has_room() {
+        None
+    }
+
+    /// Returns the next message that was never sent.
+    fn next_message(&mut self, deferred: &mut DeferredActions) -> Option<Message> {
+        if self.unsent.is_empty() || !self.numbering.has_room() {
             return None;
         }
         let message = self.unsent.pop()?;
@@ -194,23 +227,17 @@ impl<S: Socket> WriterState<S> {
             self.expired(message, deferred);
             return None;
         }
-        Some(if message.header.kind == Kind::OUTCOME {
-            self.outcome_frame(message)
-        } else {
-            self.frame(message)
-        })
+        Some(if message.header.kind == Kind::OUTCOME { self.with_outcomes_behind(message) } else { message })
     }
 
-    /// Encodes an outcome, and those behind it, as a frame.
-    fn outcome_frame(&mut self, first: Message) -> Partial {
+    /// Combines an outcome with those behind it.
+    fn with_outcomes_behind(&mut self, first: Message) -> Message {
         if outcomes::count(&first) > 1 && self.connection.gathers() {
             // An outcome that is added to another is no part of the burst, which saves a look at the clock.
             self.bursts.written(Time::now());
         }
         let link = self.numbering.outcomes_header();
-        let message =
-            with_outcomes_behind(first, link, self.payload_max, &mut self.unsent.queue, &mut self.counters);
-        self.frame(message)
+        with_outcomes_behind(first, link, self.payload_max, &mut self.unsent.queue, &mut self.counters)
     }
 
     /// Writes the next piece of the started frame.

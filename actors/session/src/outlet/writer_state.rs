@@ -319,11 +319,17 @@ impl<S: Socket> WriterState<S> {
     /// Processes a frame that was written whole: takes its receipt.
     pub(super) fn sent(&mut self, frame: &mut Partial) {
         if frame.origin == FrameOrigin::Sender {
-            self.counters.counts.sent += messages_in(&frame.message);
-            self.connection.note_sent(&frame.message.header);
+            self.sent_message(&mut frame.message);
         }
-        let expiry = frame.message.header.expiry();
-        if let Some(receipt) = frame.message.receipt.take() {
+    }
+
+    /// Same as [`sent`](Self::sent), for a sender's message that was written for the first time.
+    #[inline]
+    pub(super) fn sent_message(&mut self, message: &mut Message) {
+        self.counters.counts.sent += messages_in(message);
+        self.connection.note_sent(&message.header);
+        let expiry = message.header.expiry();
+        if let Some(receipt) = message.receipt.take() {
             let written = self.connection.written();
             self.early_outcomes.extend(self.receipts.sent(SentMessage { receipt, expiry, written }));
         }
