@@ -181,6 +181,13 @@ impl ClassQueue {
         woken
     }
 
+    /// Returns whether a caller waits for room.
+    #[must_use]
+    #[inline]
+    pub const fn is_awaited(&self) -> bool {
+        self.awaited.is_some()
+    }
+
     /// Returns the registered wakers, once there is room: half of the positions of a class, and half of the
     /// bytes or as many as its shortest message needs. Call it after each removal of a message, and wake without
     /// a lock. It costs one load while none is registered.

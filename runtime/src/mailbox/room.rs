@@ -43,6 +43,12 @@ impl RoomWakers {
     /// Wakes them. The caller holds no lock.
     #[inline]
     pub(super) fn wake(self) {
+        if !self.of_messages.is_empty() || self.of_events.is_some() {
+            self.wake_all();
+        }
+    }
+
+    fn wake_all(self) {
         self.of_messages.into_iter().chain(self.of_events).for_each(Waker::wake);
     }
 }

@@ -218,7 +218,9 @@ impl<S: Socket> WriterState<S> {
             return None;
         }
         let message = self.unsent.pop()?;
-        deferred.room.extend(self.unsent.room_made());
+        if self.unsent.is_awaited() {
+            deferred.room.extend(self.unsent.room_made());
+        }
         // One look at the clock serves all frames of a turn. The receiver checks the time to live again.
         if message.header.time_to_live_us != 0
             && message.header.is_expired(*self.checked_at.get_or_insert_with(Time::now))

@@ -180,9 +180,14 @@ impl Unsent {
         self.backlog_waits.wakers.add(room).into_iter().collect()
     }
 
-    /// Returns the wakers of senders that may find room now that a message has left the queue. Call it after each
-    /// one. It costs two loads while no sender waits.
+    /// Whether a sender waits for room.
     #[inline]
+    pub(super) fn is_awaited(&self) -> bool {
+        self.queue.is_awaited() || !self.backlog_waits.wakers.is_empty()
+    }
+
+    /// Returns the wakers of senders that may find room now that a message has left the queue. Call it after each
+    /// one, if a sender waits.
     pub(super) fn room_made(&mut self) -> Vec<Waker> {
         let mut woken = self.queue.room_made();
         if !self.backlog_waits.wakers.is_empty() && self.queue.len() <= self.backlog_waits.queued / 2 {
