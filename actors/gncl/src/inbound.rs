@@ -48,6 +48,8 @@ pub(super) struct Inbound {
     pub(super) outcomes: RefCell<PendingOutcomes>,
     /// The conversion of the peer's times, once a message of this [`Batch`] has needed it.
     pub(super) conversion: Cell<Option<Conversion>>,
+    /// The disposition of the last message of this [`Batch`], recorded with the next message or at the end.
+    pub(super) former: Cell<Option<Disposition>>,
 }
 
 /// Outcomes that are settled together.
@@ -83,6 +85,9 @@ impl Drop for Batch<'_> {
     fn drop(&mut self) {
         self.inbound.settle_outcomes();
         if let Some(session) = self.inbound.peer.session(self.inbound.lane) {
+            if let Some(disposition) = self.inbound.former.take() {
+                session.finish(disposition);
+            }
             session.acknowledge_if_due();
         }
     }
@@ -96,8 +101,8 @@ impl Inbound {
         Batch { inbound: self, _wakes: wakes::Batch::begin() }
     }
 
-    /// Processes a frame received at `now`, if it has the next number: delivers it, settles it, or refuses
-    /// and counts it.
+    /// Processes a frame of a [`Batch`] received at `now`, if it has the next number: delivers it, settles it, or
+    /// refuses and counts it.
     ///
     /// # Errors
     /// The peer violates the protocol: the frame does not have the next number, or is an invalid acknowledgement.
@@ -130,7 +135,7 @@ impl Inbound {
             return Ok(());
         }
         // The message is counted first: if its handling panics, it must not arrive again.
-        let admission = session.on_message(self.link, &message)?;
+        let admission = session.on_message(self.link, &message, self.former.take())?;
         self.spin.on_message(now);
         if admission == Admission::Drop {
             return Ok(());
@@ -146,9 +151,11 @@ impl Inbound {
         } else {
             self.process(now, message, session, admission)
         };
-        match disposition {
-            Some(disposition) => guard.finish(disposition),
-            None => guard.release(),
+        if disposition.is_some() {
+            self.former.set(disposition);
+            guard.defer();
+        } else {
+            guard.release();
         }
         Ok(())
     }

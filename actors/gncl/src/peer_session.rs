@@ -255,15 +255,28 @@ impl PeerSession {
     }
 
     /// Processes a message received on `link`. Returns whether to accept it, and its queue. An accepted
-    /// message is in process: the caller creates its [hand](Self::hand).
+    /// message is in process: the caller creates its [guard](Self::processing_guard). `former` is the disposition of
+    /// the message before it, if the caller has one that is not recorded: one lock serves both.
     ///
     /// # Errors
     /// The message does not have the next number.
-    pub(super) fn on_message(&self, link: LinkNumber, message: &Message) -> Result<Admission, RefusalError> {
+    pub(super) fn on_message(
+        &self,
+        link: LinkNumber,
+        message: &Message,
+        former: Option<Disposition>,
+    ) -> Result<Admission, RefusalError> {
         let number = message.header.number;
         let (arrival, queue) = {
             let mut inbox = self.inbox();
+            if let Some(disposition) = former {
+                inbox.counters.finish(disposition);
+            }
             if inbox.is_fenced {
+                drop(inbox);
+                if former.is_some() {
+                    self.notify_counted_of_ended();
+                }
                 return Ok(Admission::Drop);
             }
             let arrival = inbox.receiving.arrive(link.number(), number, message.size());
@@ -324,13 +337,18 @@ impl PeerSession {
             inbox.is_fenced
         };
         if is_fenced {
-            self.notifiers.fewer_outstanding.notify_one();
-            self.notifiers.queues_changed.notify_one();
+            self.notify_counted_of_ended();
         }
     }
 
+    /// Notifies the waiters for the messages of an ended incarnation that one is no longer in process.
+    fn notify_counted_of_ended(&self) {
+        self.notifiers.fewer_outstanding.notify_one();
+        self.notifiers.queues_changed.notify_one();
+    }
+
     /// Records the disposition of a message in process.
-    fn finish(&self, disposition: Disposition) {
+    pub(super) fn finish(&self, disposition: Disposition) {
         self.update_counters(|counters| counters.finish(disposition));
     }
 
