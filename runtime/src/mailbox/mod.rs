@@ -409,16 +409,20 @@ impl Mailbox {
                 shared.tallies[class].refused += 1;
                 return Err(SubmitError::new(message, Rejection::Unsupported));
             }
-            if !shared.queue.has_room_for(&message) {
+            self.record_wait(&mut shared);
+            let mut pushed = shared.queue.push(message);
+            if let Err(SubmitError { message, why }) = pushed {
                 // An application that waits for its start takes no messages, so expired ones are removed here
                 // to make room.
                 expired = shared.expire(self.clock.now());
-                if !expired.is_empty() {
+                pushed = if expired.is_empty() {
+                    Err(SubmitError::new(message, why))
+                } else {
                     room = shared.room_made();
-                }
+                    shared.queue.push(message)
+                };
             }
-            self.record_wait(&mut shared);
-            match shared.queue.push(message) {
+            match pushed {
                 Ok(superseded) => {
                     shared.tallies[class].taken += 1;
                     shared.tallies[class].superseded += u64::from(superseded.is_some());

@@ -154,12 +154,6 @@ impl ClassQueue {
         self.lanes[message.header.class as usize].push_back(message);
     }
 
-    /// Returns whether there is room for this message.
-    #[must_use]
-    pub fn has_room_for(&self, message: &Message) -> bool {
-        self.bounds.has_room_for(message.payload.len(), self.held(message.header.class as usize))
-    }
-
     /// Returns the messages that occupy positions of a lane: those queued in it, and those moved forward from it.
     pub(super) fn held(&self, class: usize) -> Usage {
         let at_ends = self.ends.of_lane(class);
