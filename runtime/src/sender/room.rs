@@ -216,7 +216,8 @@ impl<'a, C: Content> RoomBuilder<&'a Sender, C> {
     }
 }
 
-/// The future of a message without a confirmation that waits for room: [`RoomBuilder::send`].
+/// The future of a message without a confirmation that waits for room: [`RoomBuilder::send`]. Any thread may poll it,
+/// with any executor. A tokio runtime that polls it must have its time enabled.
 #[derive(Debug)]
 #[must_use = "the message is sent only while this is polled"]
 pub struct SendWhenRoom<S>(Result<Waiting<S>, Option<SendError>>);
@@ -232,7 +233,8 @@ impl<S: Borrow<Sender> + Unpin> Future for SendWhenRoom<S> {
     }
 }
 
-/// The future of a confirmed message that waits for room: [`RoomBuilder::confirmed`].
+/// The future of a confirmed message that waits for room: [`RoomBuilder::confirmed`]. Any thread may poll it, with any
+/// executor. A tokio runtime that polls it must have its time enabled.
 #[derive(Debug)]
 #[must_use = "the message is sent only while this is polled"]
 pub struct ConfirmWhenRoom<S>(Result<(Waiting<S>, Option<(Wait, Duration)>), Option<SendError>>);
