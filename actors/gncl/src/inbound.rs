@@ -23,7 +23,7 @@ use super::{
     core::{Lane, RefusalError, read},
     datagrams::{Announcement, Freshness},
     peer::Peer,
-    peer_session::{Admission, PeerSession, ProcessingGuard},
+    peer_session::{Admission, FramesBehind, PeerSession, ProcessingGuard},
     receive_counters::Disposition,
     spin::Spin,
 };
@@ -78,6 +78,8 @@ pub(super) type Conversion = (Time, Option<ClockConversion>);
 /// sent if that is due. Then the receivers of messages are woken.
 pub(super) struct Batch<'a> {
     inbound: &'a Inbound,
+    /// The frames behind it.
+    pub(super) behind: FramesBehind,
     _wakes: wakes::Batch,
 }
 
@@ -88,17 +90,17 @@ impl Drop for Batch<'_> {
             if let Some(disposition) = self.inbound.former.take() {
                 session.finish(disposition);
             }
-            session.acknowledge_if_due();
+            session.acknowledge_if_due(self.behind);
         }
     }
 }
 
 impl Inbound {
     /// Starts a batch: frames that were read together at `now` are [received](Self::receive) while it exists.
-    pub(super) fn batch(&self, now: Time) -> Batch<'_> {
+    pub(super) fn batch(&self, now: Time, behind: FramesBehind) -> Batch<'_> {
         self.peer.mark_alive(now);
         self.conversion.set(None);
-        Batch { inbound: self, _wakes: wakes::Batch::begin() }
+        Batch { inbound: self, behind, _wakes: wakes::Batch::begin() }
     }
 
     /// Processes a frame of a [`Batch`] received at `now`, if it has the next number: delivers it, settles it, or
@@ -194,6 +196,13 @@ impl Inbound {
         match self.process(now, message, session, Admission::Deliver) {
             Some(disposition) => guard.finish(disposition),
             None => guard.release(),
+        }
+    }
+
+    /// Sends the ACK that is due, as nothing more has arrived.
+    pub(super) fn acknowledge_if_due(&self) {
+        if let Some(session) = self.peer.session(self.lane) {
+            session.acknowledge_if_due(FramesBehind::None);
         }
     }
 

@@ -5,7 +5,7 @@ use std::collections::VecDeque;
 use super::{Ack, FIRST, SendPosition};
 
 /// Bounds of the unacknowledged messages. At least one message is always allowed.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
 pub struct Window {
     /// Maximum number of messages. A further one waits.
     pub messages: usize,
