@@ -157,5 +157,10 @@ fn sender_for_a_held_destination_waits_for_its_release() {
     assert_eq!((refused.why, woken.0.load(Ordering::Relaxed)), (Rejection::QueueFull, 0));
     hold(&bench, 3, Vec::new());
     assert_eq!(woken.0.load(Ordering::Relaxed), 1);
+    // And: the released messages fill the queue until they are written.
+    let refused = bench.outlet.offer(refused.message, Some(&waker)).unwrap_err();
+    assert_eq!((refused.why, woken.0.load(Ordering::Relaxed)), (Rejection::QueueFull, 1));
+    bench.drain();
+    assert_eq!(woken.0.load(Ordering::Relaxed), 2);
     bench.outlet.offer(refused.message, Some(&waker)).expect("it has room");
 }
