@@ -12,6 +12,7 @@ use sinew_runtime::{
 
 use super::{
     Account, LinkNumber, Socket, Taking,
+    batch::SHORT,
     deferred::DeferredActions,
     partial::{FrameOrigin, Partial, Written},
     progress::is_for_the_program,
@@ -140,6 +141,12 @@ impl<S: Socket> Connection<S> {
     /// Bytes of frames that the socket has room to gather.
     pub(super) fn gather_room(&self) -> usize {
         if let Link::Up(socket) = &self.link { socket.gather_room() } else { 0 }
+    }
+
+    /// Whether the gathered bytes leave no room for every short frame, so that they are written now: the frame that
+    /// finds no room would be written alone.
+    pub(super) fn is_gathered_full(&self) -> bool {
+        self.gathered() > 0 && self.gather_room() < SHORT
     }
 
     /// Lets the socket gather the frame of a message, for which it has [room](Self::gather_room).

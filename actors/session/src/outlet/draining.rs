@@ -66,7 +66,7 @@ impl<S: Socket> WriterState<S> {
                 Some(Poll::Ready(Err(error))) => self.connection.fail(error),
                 Some(Poll::Ready(Ok(()))) => bytes += self.gather_next(deferred),
             }
-            if bytes >= BYTES_PER_WAKE {
+            if bytes >= BYTES_PER_WAKE || self.connection.is_gathered_full() {
                 break;
             }
         }
@@ -83,7 +83,7 @@ impl<S: Socket> WriterState<S> {
         self.checked_at = None;
         let mut bytes = 0;
         for _ in 0..HELP_AT {
-            if bytes >= BYTES_PER_WAKE || !self.has_frame() {
+            if bytes >= BYTES_PER_WAKE || self.connection.is_gathered_full() || !self.has_frame() {
                 break;
             }
             bytes += self.gather_next(deferred);

@@ -278,3 +278,24 @@ fn gathered_messages_of_a_session_are_numbered_and_sent_again() {
     assert_eq!(seen(&wire), expected(10..40));
     assert_eq!(outlet.counts().sent, 40);
 }
+
+#[test]
+fn full_buffer_is_written_without_a_single_frame_behind_it() {
+    // Given: many messages of a burst, of which one more than the buffer has room for would be written alone
+    let limits = OutletLimits { queue_capacity: 200, queue_bytes: 1 << 20, ..LIMITS };
+    let (outlet, wire, writes) = (SocketWriter::new(limits), Arc::new(Wire::default()), Arc::default());
+    let socket = Counting { wire: Arc::clone(&wire), writes: Arc::clone(&writes) };
+    let link = outlet.connect(Gathering::new(socket, Checksum::Crc), usize::MAX, None);
+    for value in 0..180 {
+        let header = Header { sent: Time::from_nanos(1_000_000), ..message(Class::Bulk, value).header };
+        outlet.submit(Message::new(header, vec![value; 1_000].into())).unwrap();
+    }
+    // When: the wire accepts everything
+    wire.room.store(PLENTY, Ordering::Relaxed);
+    let before = writes.load(Ordering::Relaxed);
+    assert!((0..16).find_map(|_| outlet.drain(link).now_or_never()).is_none());
+    // Then: 180 frames of 1064 bytes are four writes
+    let frames = frames(&wire.bytes.lock().unwrap());
+    assert_eq!(frames.len(), 180);
+    assert_eq!(writes.load(Ordering::Relaxed) - before, 4);
+}
