@@ -156,8 +156,8 @@ pub mod message {
     pub use sinew_runtime::{
         outcome::{MemberOutcome, Outcome, Rejection},
         sender::{
-            AskError, Confirmation, Destination, GroupConfirmation, Reply, SendError, Sender,
-            UnknownNameError,
+            AskError, ConfirmWhenRoom, Confirmation, Destination, GroupConfirmation, Reply, SendError,
+            SendWhenRoom, Sender, StalledError, StalledQueue, UnknownNameError,
         },
         wire::{Class, Kind, MessageBuffer, MismatchPolicy, Payload, TIME_TO_LIVE_MAX},
     };

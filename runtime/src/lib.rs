@@ -13,7 +13,7 @@
 //! | [`event_queue`] | event queues of actors, which outlive the actors |
 //! | [`mailbox`] | message queues of applications, which outlive the applications |
 //! | [`monitor`] | notifications of the end of an application |
-//! | [`wakes`] | one wake for a batch of messages |
+//! | [`wakes`], [`WakerList`] | one wake for a batch of messages; the tasks that wait for one event |
 //! | [`remedy`] | remedies for failed system calls |
 //! | [`safe_wake`] | wakes from threads without usable thread-local variables |
 //! | [`pending`], [`sender`] | sending, and waiting for outcomes and replies |
@@ -62,8 +62,10 @@ pub mod time;
 #[cfg(target_os = "linux")]
 pub mod timer;
 pub mod undelivered;
+mod waker_list;
 pub mod wakes;
 pub mod wire;
 
 pub use locking::lock;
 pub use sinew_params as parameters;
+pub use waker_list::WakerList;

@@ -9,6 +9,7 @@ pub mod guard;
 pub mod mismatches;
 mod reach;
 mod retained;
+mod room;
 mod sink;
 mod stop;
 pub mod tap;
@@ -19,13 +20,14 @@ use std::{
     collections::BTreeMap,
     sync::{
         Arc, Mutex, OnceLock,
-        atomic::{AtomicU64, Ordering},
+        atomic::{AtomicU64, AtomicUsize, Ordering},
     },
     task::Waker,
 };
 
 use arc_swap::ArcSwap;
 
+pub(crate) use self::room::RoomWait;
 use self::{
     copies::Copies,
     each::OpenSends,
@@ -122,6 +124,8 @@ pub struct Router {
     stop: Arc<StopLatch>,
     /// The applications of which echoes are handed over after a stop.
     echo_sources: ArcSwap<stop::EchoSources>,
+    /// The number of messages that wait for room in a queue.
+    room_waits: AtomicUsize,
     /// The clock of the applications that send with this table.
     clock: Clock,
 }
@@ -141,6 +145,7 @@ impl Router {
             retained: Mutex::default(),
             stop: Arc::default(),
             echo_sources: ArcSwap::default(),
+            room_waits: AtomicUsize::new(0),
             clock: Clock::WALL,
         }
     }

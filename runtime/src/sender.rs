@@ -7,6 +7,7 @@ mod directory;
 mod expecting;
 mod groups;
 mod reply;
+mod room;
 mod sent_types;
 mod stop;
 mod unknown_name;
@@ -29,6 +30,7 @@ pub use self::{
     destination::Destination,
     directory::Directory,
     reply::ReplyTo,
+    room::{ConfirmWhenRoom, RoomBuilder, SendWhenRoom, StalledError, StalledQueue},
     unknown_name::UnknownNameError,
 };
 use crate::{
@@ -75,8 +77,13 @@ pub enum SendError {
     /// The sender was replaced: its application hung, or did not stop in time. A later incarnation owns this TID now.
     #[error("this incarnation of the application has ended; a later one has replaced it")]
     Over,
-    /// Too many confirmed messages and requests await their outcomes.
-    #[error("too many confirmed messages and requests are under way; wait for some to end")]
+    /// The message found no room in time.
+    #[error(transparent)]
+    Stalled(#[from] StalledError),
+    /// Too many confirmed messages and requests await their outcomes, or too many messages wait for room.
+    #[error(
+        "too many confirmed messages, requests and messages without room are under way; wait for some to end"
+    )]
     TooManyWaits,
     /// A group or a broadcast has one outcome per member, not a single one.
     #[error(
@@ -340,10 +347,10 @@ impl Sender {
     /// }
     /// ```
     pub fn message<'a, P: Payload>(
-        &'a self,
+        &self,
         to: impl Into<Destination<'a>>,
         value: &'a P,
-    ) -> MessageBuilder<&'a Self, Value<'a, P>> {
+    ) -> MessageBuilder<&Self, Value<'a, P>> {
         MessageBuilder::new(self, Value { destination: to.into(), value })
     }
 
@@ -455,23 +462,33 @@ impl Sender {
         }
     }
 
+    /// Returns why this incarnation may not send the message; `None` if it may.
+    #[inline]
+    fn why_not_sent(&self, message: &Message) -> Option<(Rejection, SendError)> {
+        let kind = message.header.kind;
+        if self.is_over() {
+            Some((Rejection::Closed, SendError::Over))
+        } else if !kind.is_user() {
+            // Layers' messages bypass the guards, and an invalid one ends a link, so an application must not send them.
+            Some((Rejection::UnknownKind, SendError::NotYours(kind)))
+        } else if message.payload.len() > self.shared.payload_max {
+            Some((Rejection::TooLong, Rejection::TooLong.into()))
+        } else {
+            None
+        }
+    }
+
+    fn next_sequence(&self) -> u64 {
+        self.shared.sequence.fetch_add(1, Ordering::Relaxed).wrapping_add(1)
+    }
+
     /// Sends the message and returns when it was sent.
     fn dispatch(&self, mut message: Message) -> Result<Time, SendError> {
-        if self.is_over() {
-            message.reject(Rejection::Closed);
-            return Err(SendError::Over);
+        if let Some((why, error)) = self.why_not_sent(&message) {
+            message.reject(why);
+            return Err(error);
         }
-        let kind = message.header.kind;
-        if !kind.is_user() {
-            // Layers' messages bypass the guards, and an invalid one ends a link, so an application must not send them.
-            message.reject(Rejection::UnknownKind);
-            return Err(SendError::NotYours(kind));
-        }
-        if message.payload.len() > self.shared.payload_max {
-            message.reject(Rejection::TooLong);
-            return Err(Rejection::TooLong.into());
-        }
-        message.header.sequence = self.shared.sequence.fetch_add(1, Ordering::Relaxed).wrapping_add(1);
+        message.header.sequence = self.next_sequence();
         let sent = self.now();
         message.header.sent = sent;
         self.shared.router.send(message)?;

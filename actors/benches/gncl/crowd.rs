@@ -10,7 +10,6 @@ use std::{
     time::{Duration, Instant},
 };
 
-use rustix::time::{ClockId, clock_gettime};
 use serde::{Deserialize, Serialize};
 use sinew::prelude::*;
 use sinew_figures::{
@@ -92,7 +91,7 @@ pub(crate) struct Seen {
 
 impl Seen {
     pub(crate) fn begin() -> Self {
-        Self { figures: Figures::new(), total_ns: 0, cpu: cpu_time(), sleeps: process::sleeps() }
+        Self { figures: Figures::new(), total_ns: 0, cpu: process::cpu_time(), sleeps: process::sleeps() }
     }
 
     pub(crate) fn record(&mut self, took_ns: u64) {
@@ -101,7 +100,7 @@ impl Seen {
     }
 
     pub(crate) fn end(mut self) -> Self {
-        self.cpu = cpu_time().saturating_sub(self.cpu);
+        self.cpu = process::cpu_time().saturating_sub(self.cpu);
         self.sleeps = process::sleeps().saturating_sub(self.sleeps);
         self
     }
@@ -302,12 +301,6 @@ impl Sum {
         Alone { bench: "gncl", case, figure: "CPU of a node each second", seen: &seen, counts: &counts }
             .report();
     }
-}
-
-/// The time that this process had a CPU, with all its threads.
-fn cpu_time() -> Duration {
-    let time = clock_gettime(ClockId::ProcessCPUTime);
-    Duration::new(time.tv_sec as u64, time.tv_nsec as u32)
 }
 
 fn number(word: &str) -> u64 {

@@ -9,7 +9,9 @@
 //!   `gncl.spin`) or on their own threads. The reference is blocking TCP. `sleeps` is the number of sleeps of
 //!   a thread of either process per message that another thread had to end.
 //! - `flood-CARRIER-CPUS`: one-way packets of 1000 bytes in class Bulk, as fast as possible, confirmed or
-//!   not, and over bare TCP, with one write for each packet and one for 32.
+//!   not, and over bare TCP, with one write for each packet and one for 32. `cpu_ns_each_message` is the CPU time
+//!   of the sending process per packet, `cpu_ns_each_message_there` that of the receiving one. The number of
+//!   packets is fixed: 1,000,000, or 100,000 with `--short`.
 //! - `secured-rounds-..`, `secured-flood-..`: the same between nodes with keys (TLS 1.3), beside nodes
 //!   without. `secured-handshake`: the time until both ends of a connection have authenticated each other.
 //! - `table_2-N`: the paper's test. Every node sends 1000 bytes to every other one with a full echo: 3, 8 and

@@ -1,8 +1,5 @@
 //! The cost of values of class Stream, by datagrams and by the connection, from one node to another.
 
-use std::time::Duration;
-
-use rustix::time::{ClockId, clock_gettime};
 use sinew::{Node, audit::Place};
 use sinew_figures::{
     Alone, Figures,
@@ -20,9 +17,7 @@ pub(crate) const CHANNELS: [usize; 3] = [1, 16, 64];
 
 /// Nanoseconds that this process had a CPU, how often its threads went to sleep, and datagrams that this host has sent.
 fn meter() -> [u64; 3] {
-    let cpu = clock_gettime(ClockId::ProcessCPUTime);
-    let cpu = Duration::new(cpu.tv_sec as u64, cpu.tv_nsec as u32);
-    [u64::try_from(cpu.as_nanos()).unwrap_or(u64::MAX), process::sleeps(), datagrams()]
+    [u64::try_from(process::cpu_time().as_nanos()).unwrap_or(u64::MAX), process::sleeps(), datagrams()]
 }
 
 /// Datagrams that this host has sent so far; 0 if the system does not report them.

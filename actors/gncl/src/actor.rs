@@ -212,8 +212,9 @@ impl Gncl {
         session.attach(link);
         let spin = if thread.is_io() { self.spin.clone() } else { Arc::default() };
         let (state, peer_there, met) = (self.state.clone(), peer.clone(), peer.clone());
-        let (outcomes, conversion) = (RefCell::default(), Cell::default());
-        let inbound = Inbound { state, peer: peer_there, spin, lane, link, checksum, outcomes, conversion };
+        let (outcomes, conversion, former) = (RefCell::default(), Cell::default(), Cell::default());
+        let inbound =
+            Inbound { state, peer: peer_there, spin, lane, link, checksum, outcomes, conversion, former };
         // Before the first message is read: the types of a former incarnation do not count for this one.
         self.state.ctx.router.set_peer(node, peer.clone());
         wire.set_mode(Mode::Relocate(inbound, Relocation { thread: thread.clone(), transport }));

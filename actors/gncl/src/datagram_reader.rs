@@ -193,6 +193,7 @@ impl Reader {
             checksum: Checksum::Crc,
             outcomes: RefCell::default(),
             conversion: Cell::default(),
+            former: Cell::default(),
         }
     }
 

@@ -23,7 +23,7 @@ use super::{
     core::{Lane, RefusalError, read},
     datagrams::{Announcement, Freshness},
     peer::Peer,
-    peer_session::{Admission, PeerSession, ProcessingGuard},
+    peer_session::{Admission, FramesBehind, PeerSession, ProcessingGuard},
     receive_counters::Disposition,
     spin::Spin,
 };
@@ -48,6 +48,8 @@ pub(super) struct Inbound {
     pub(super) outcomes: RefCell<PendingOutcomes>,
     /// The conversion of the peer's times, once a message of this [`Batch`] has needed it.
     pub(super) conversion: Cell<Option<Conversion>>,
+    /// The disposition of the last message of this [`Batch`], recorded with the next message or at the end.
+    pub(super) former: Cell<Option<Disposition>>,
 }
 
 /// Outcomes that are settled together.
@@ -76,6 +78,8 @@ pub(super) type Conversion = (Time, Option<ClockConversion>);
 /// sent if that is due. Then the receivers of messages are woken.
 pub(super) struct Batch<'a> {
     inbound: &'a Inbound,
+    /// The frames behind it.
+    pub(super) behind: FramesBehind,
     _wakes: wakes::Batch,
 }
 
@@ -83,21 +87,24 @@ impl Drop for Batch<'_> {
     fn drop(&mut self) {
         self.inbound.settle_outcomes();
         if let Some(session) = self.inbound.peer.session(self.inbound.lane) {
-            session.acknowledge_if_due();
+            if let Some(disposition) = self.inbound.former.take() {
+                session.finish(disposition);
+            }
+            session.acknowledge_if_due(self.behind);
         }
     }
 }
 
 impl Inbound {
     /// Starts a batch: frames that were read together at `now` are [received](Self::receive) while it exists.
-    pub(super) fn batch(&self, now: Time) -> Batch<'_> {
+    pub(super) fn batch(&self, now: Time, behind: FramesBehind) -> Batch<'_> {
         self.peer.mark_alive(now);
         self.conversion.set(None);
-        Batch { inbound: self, _wakes: wakes::Batch::begin() }
+        Batch { inbound: self, behind, _wakes: wakes::Batch::begin() }
     }
 
-    /// Processes a frame received at `now`, if it has the next number: delivers it, settles it, or refuses
-    /// and counts it.
+    /// Processes a frame of a [`Batch`] received at `now`, if it has the next number: delivers it, settles it, or
+    /// refuses and counts it.
     ///
     /// # Errors
     /// The peer violates the protocol: the frame does not have the next number, or is an invalid acknowledgement.
@@ -130,7 +137,7 @@ impl Inbound {
             return Ok(());
         }
         // The message is counted first: if its handling panics, it must not arrive again.
-        let admission = session.on_message(self.link, &message)?;
+        let admission = session.on_message(self.link, &message, self.former.take())?;
         self.spin.on_message(now);
         if admission == Admission::Drop {
             return Ok(());
@@ -146,9 +153,11 @@ impl Inbound {
         } else {
             self.process(now, message, session, admission)
         };
-        match disposition {
-            Some(disposition) => guard.finish(disposition),
-            None => guard.release(),
+        if disposition.is_some() {
+            self.former.set(disposition);
+            guard.defer();
+        } else {
+            guard.release();
         }
         Ok(())
     }
@@ -187,6 +196,13 @@ impl Inbound {
         match self.process(now, message, session, Admission::Deliver) {
             Some(disposition) => guard.finish(disposition),
             None => guard.release(),
+        }
+    }
+
+    /// Sends the ACK that is due, as nothing more has arrived.
+    pub(super) fn acknowledge_if_due(&self) {
+        if let Some(session) = self.peer.session(self.lane) {
+            session.acknowledge_if_due(FramesBehind::None);
         }
     }
 

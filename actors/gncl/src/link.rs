@@ -28,6 +28,7 @@ use super::{
     authenticator::{self, AuthError, Authenticator, TlsRole},
     core::{ConnectionId, HANDSHAKE_PAYLOAD_MAX, RefusalError},
     inbound::Inbound,
+    peer_session::FramesBehind,
     task::{ReadingTask, Relocation, TaskThread},
     transport::{ReadResult, Transport},
 };
@@ -266,6 +267,8 @@ pub(super) struct Reader {
     pause: Duration,
     /// Bytes of the next read, on a link: more after a full read.
     next_read_len: usize,
+    /// Whether the last read was full, so that more bytes have probably arrived.
+    read_was_full: bool,
     /// Whether the end was already reported with its reason.
     is_over: bool,
 }
@@ -301,6 +304,7 @@ impl Reader {
             turn: 0,
             pause: REFUSED_PAUSE,
             next_read_len: READ_LEN,
+            read_was_full: false,
             is_over: false,
         }
     }
@@ -373,14 +377,16 @@ impl Reader {
         self.codec.set_payload_max(payload_max);
         self.codec.set_checksum(checksum);
         let now = Time::now();
-        let _batch = if let Mode::Linked(inbound) = &*mode { Some(inbound.batch(now)) } else { None };
+        let behind = if self.read_was_full { FramesBehind::Likely } else { FramesBehind::None };
+        let linked = if let Mode::Linked(inbound) = &*mode { Some(inbound) } else { None };
+        let mut batch = linked.map(|inbound| inbound.batch(now, behind));
         for _ in 0..FRAMES_PER_WAKE {
             let message = match self.codec.decode(&mut self.buffer) {
                 Ok(Some(message)) => message,
                 Ok(None) => return Decoded::Empty(next),
                 Err(error) => return Decoded::Event(EventKind::Violated(decline(&error))),
             };
-            let Mode::Linked(inbound) = &*mode else { return Decoded::Event(EventKind::Frame(message)) };
+            let Some(inbound) = linked else { return Decoded::Event(EventKind::Frame(message)) };
             let (length, limit) = (message.payload.len(), self.longest(&message));
             if length > limit {
                 let error = FrameError::TooLong { length, limit };
@@ -403,6 +409,7 @@ impl Reader {
                 return Decoded::Empty(next);
             }
         }
+        batch.iter_mut().for_each(|batch| batch.behind = FramesBehind::Likely);
         Decoded::Again
     }
 
@@ -418,6 +425,23 @@ impl Reader {
         self.turn = 0;
         self.thread.end_turn();
         tokio::task::yield_now().await;
+    }
+
+    /// Receives bytes. Before it waits for them after a full read, it sends the ACK that is due.
+    async fn receive(&mut self, room: usize) -> io::Result<ReadResult> {
+        let mut may_be_due = std::mem::take(&mut self.read_was_full);
+        let mut receive = std::pin::pin!(self.transport.receive(&mut self.buffer, room));
+        std::future::poll_fn(|cx| {
+            let received = receive.as_mut().poll(cx);
+            if received.is_pending()
+                && std::mem::take(&mut may_be_due)
+                && let Mode::Linked(inbound) = &*lock(&self.reading.mode)
+            {
+                inbound.acknowledge_if_due();
+            }
+            received
+        })
+        .await
     }
 
     async fn fill(&mut self, next: NextRead) -> io::Result<()> {
@@ -436,10 +460,11 @@ impl Reader {
             self.yield_turn().await;
         }
         let room = (self.buffer.capacity() - self.buffer.len()).min(BYTES_PER_TURN);
-        match self.transport.receive(&mut self.buffer, room).await? {
+        match self.receive(room).await? {
             ReadResult { count: 0, .. } => Err(io::ErrorKind::UnexpectedEof.into()),
             ReadResult { count, work } => {
                 self.turn += work;
+                self.read_was_full = count == room;
                 self.next_read_len =
                     if count < room { READ_LEN } else { BYTES_PER_TURN.min(2 * self.next_read_len) };
                 Ok(())

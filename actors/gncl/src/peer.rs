@@ -9,6 +9,7 @@ use std::{
         Arc, Mutex,
         atomic::{AtomicBool, AtomicU64, Ordering},
     },
+    task::Waker,
 };
 
 use sinew_model::{periodic_checks::PeriodicChecks, undelivered::Report};
@@ -293,6 +294,23 @@ impl MessageSink for Peer {
             Some(channel) if message.header.class == Class::Stream => channel.submit(message, session)?,
             Some(_) | None => session.outlet.submit(message)?,
         }
+        if has_a_time {
+            self.expiring.request();
+        }
+        Ok(())
+    }
+
+    /// A value of class Stream waits for no room: a newer one takes its place.
+    fn offer(&self, message: Message, room: Option<&Waker>) -> Result<(), SubmitError> {
+        if message.header.class == Class::Stream {
+            return self.submit(message);
+        }
+        // SYNC: as in `submit`.
+        if self.is_over.load(Ordering::Acquire) {
+            return Err(SubmitError::new(message, Rejection::NoSuchNode));
+        }
+        let has_a_time = message.header.time_to_live_us != 0 || message.receipt.is_some();
+        self.session_for(message.header.class).outlet.offer(message, room)?;
         if has_a_time {
             self.expiring.request();
         }

@@ -4,10 +4,7 @@ mod acks;
 mod destination_queues;
 mod processing_guard;
 
-use std::sync::{
-    Arc, Mutex, MutexGuard, PoisonError,
-    atomic::{AtomicBool, Ordering},
-};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use bytes::Bytes;
 use sinew_runtime::{
@@ -34,6 +31,8 @@ use super::{
     receive_counters::{Disposition, ReceiveCounters},
     transport::Transport,
 };
+use acks::AckMarks;
+pub(super) use acks::FramesBehind;
 pub(super) use processing_guard::ProcessingGuard;
 use sinew_model::{config::NodeConfig, periodic_checks::PeriodicChecks, refusals::Refusals};
 
@@ -185,9 +184,8 @@ pub struct PeerSession {
     pub outlet: SocketWriter<Gathering<Transport>>,
     /// Locked only briefly, never while another lock is held.
     inbox: Mutex<Inbox>,
-    /// Whether an ACK must be sent, as soon as the frames read together have been processed. Written with the
-    /// inbox locked. SYNC: Relaxed; a reader without that lock asks for the marks of its own thread.
-    ack_is_due: AtomicBool,
+    /// Whether an ACK must be sent, as soon as the frames read together have been processed.
+    ack_marks: AckMarks,
     /// The window granted to the peer while applications accept messages.
     window: Window,
     /// Bytes of the longest frame.
@@ -244,8 +242,8 @@ impl PeerSession {
             is_abandoned: false,
         });
         let outcomes_max = outcomes_max(parameters.sessions, config.gncl.queue_capacity);
-        let (ack_is_due, notifiers) = (AtomicBool::new(false), notifiers.clone());
-        Self { outlet, inbox, ack_is_due, window, longest, outcomes_max, parameters, notifiers }
+        let (ack_marks, notifiers) = (AckMarks::default(), notifiers.clone());
+        Self { outlet, inbox, ack_marks, window, longest, outcomes_max, parameters, notifiers }
     }
 
     /// Accepts messages on `link` from now on, and on no other connection.
@@ -255,22 +253,35 @@ impl PeerSession {
     }
 
     /// Processes a message received on `link`. Returns whether to accept it, and its queue. An accepted
-    /// message is in process: the caller creates its [hand](Self::hand).
+    /// message is in process: the caller creates its [guard](Self::processing_guard). `former` is the disposition of
+    /// the message before it, if the caller has one that is not recorded: one lock serves both.
     ///
     /// # Errors
     /// The message does not have the next number.
-    pub(super) fn on_message(&self, link: LinkNumber, message: &Message) -> Result<Admission, RefusalError> {
+    pub(super) fn on_message(
+        &self,
+        link: LinkNumber,
+        message: &Message,
+        former: Option<Disposition>,
+    ) -> Result<Admission, RefusalError> {
         let number = message.header.number;
         let (arrival, queue) = {
             let mut inbox = self.inbox();
+            if let Some(disposition) = former {
+                inbox.counters.finish(disposition);
+            }
             if inbox.is_fenced {
+                drop(inbox);
+                if former.is_some() {
+                    self.notify_counted_of_ended();
+                }
                 return Ok(Admission::Drop);
             }
             let arrival = inbox.receiving.arrive(link.number(), number, message.size());
             if let Arrival::Take { ack_is_due } = arrival {
                 inbox.counters.start();
                 if ack_is_due {
-                    self.ack_is_due.store(true, Ordering::Relaxed);
+                    self.ack_marks.set_due(&inbox.receiving);
                 }
             }
             (arrival, inbox.queue_for(message))
@@ -324,13 +335,18 @@ impl PeerSession {
             inbox.is_fenced
         };
         if is_fenced {
-            self.notifiers.fewer_outstanding.notify_one();
-            self.notifiers.queues_changed.notify_one();
+            self.notify_counted_of_ended();
         }
     }
 
+    /// Notifies the waiters for the messages of an ended incarnation that one is no longer in process.
+    fn notify_counted_of_ended(&self) {
+        self.notifiers.fewer_outstanding.notify_one();
+        self.notifiers.queues_changed.notify_one();
+    }
+
     /// Records the disposition of a message in process.
-    fn finish(&self, disposition: Disposition) {
+    pub(super) fn finish(&self, disposition: Disposition) {
         self.update_counters(|counters| counters.finish(disposition));
     }
 

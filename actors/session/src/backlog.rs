@@ -360,6 +360,11 @@ impl<K: Copy + Ord, M: Expires> SendBacklog<K, M> {
         self.backlog.messages()
     }
 
+    /// Returns the last change received on the current connection; `None` before the first.
+    pub const fn change(&self) -> Option<u64> {
+        self.change
+    }
+
     /// Resets the change number for a new connection: the first announcement on it always counts.
     pub const fn link_ended(&mut self) {
         self.change = None;

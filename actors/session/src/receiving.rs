@@ -7,6 +7,13 @@ const ACK_EVERY: usize = 32;
 /// Received bytes of frames after which an ACK is sent.
 const ACK_EVERY_BYTES: usize = 64 << 10;
 
+/// Most messages after which an ACK does not wait any longer until nothing more has arrived.
+const ACK_LATEST: usize = 128;
+/// Bytes of frames for the same.
+const ACK_LATEST_BYTES: usize = 256 << 10;
+/// Part of the announced room for the same: the sender has the rest while the ACK is on its way.
+const LATEST_PART: usize = 8;
+
 /// How to handle a numbered frame.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Arrival {
@@ -94,11 +101,31 @@ impl Receiving {
         self.next += 1;
         self.unacknowledged += 1;
         self.unacknowledged_bytes += bytes;
+        Arrival::Take { ack_is_due: self.reaches(self.due()) }
+    }
+
+    /// Returns the unacknowledged messages after which an ACK is due.
+    fn due(&self) -> Window {
+        let every = Window { messages: ACK_EVERY, bytes: ACK_EVERY_BYTES };
         // A sender with little room must get an ACK before it has used all of it.
-        let (messages, bytes) = self.room.map_or((ACK_EVERY, ACK_EVERY_BYTES), |room| {
-            (ACK_EVERY.min(room.messages / 2), ACK_EVERY_BYTES.min(room.bytes / 2))
-        });
-        Arrival::Take { ack_is_due: self.unacknowledged >= messages || self.unacknowledged_bytes >= bytes }
+        self.room.map_or(every, |Window { messages, bytes }| Window {
+            messages: every.messages.min(messages / 2),
+            bytes: every.bytes.min(bytes / 2),
+        })
+    }
+
+    /// Whether a due ACK must be sent even while more messages have arrived already. Until then it can wait for
+    /// them: a sender that has no room left sends nothing more, so that this wait ends.
+    pub fn is_ack_overdue(&self) -> bool {
+        let (due, room) = (self.due(), self.room.unwrap_or_default());
+        self.reaches(Window {
+            messages: due.messages.max(ACK_LATEST.min(room.messages / LATEST_PART)),
+            bytes: due.bytes.max(ACK_LATEST_BYTES.min(room.bytes / LATEST_PART)),
+        })
+    }
+
+    const fn reaches(&self, Window { messages, bytes }: Window) -> bool {
+        self.unacknowledged >= messages || self.unacknowledged_bytes >= bytes
     }
 
     /// Whether the sender must be notified of `room` at once. It must be at least twice the room announced

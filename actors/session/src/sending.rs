@@ -5,7 +5,7 @@ use std::collections::VecDeque;
 use super::{Ack, FIRST, SendPosition};
 
 /// Bounds of the unacknowledged messages. At least one message is always allowed.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
 pub struct Window {
     /// Maximum number of messages. A further one waits.
     pub messages: usize,
@@ -132,6 +132,11 @@ impl<M> Sending<M> {
     /// Returns the number of messages to retransmit.
     pub fn behind(&self) -> usize {
         self.cursor.map_or(0, |cursor| (self.end() - cursor) as usize)
+    }
+
+    /// Returns the number that [`keep`](Self::keep) gives to the next message.
+    pub fn next_number(&self) -> u64 {
+        self.end()
     }
 
     /// Keeps a message at the write of its frame of `bytes`, and returns its number. Requires

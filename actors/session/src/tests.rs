@@ -327,3 +327,23 @@ fn numbers_continue_beyond_sixteen_bits() {
     }
     assert_eq!(receiving.ack(1, None).next, 70_001);
 }
+
+#[test]
+fn due_ack_waits_for_arrived_messages_up_to_a_part_of_the_room() {
+    let cases =
+        [(None, 32, 32), (Some(1_024), 32, 128), (Some(512), 32, 64), (Some(64), 32, 32), (Some(20), 10, 10)];
+    for (room, due, overdue) in cases {
+        let mut receiving = Receiving::new(1);
+        receiving.attach(1);
+        receiving.on_epoch(1, 1);
+        receiving.ack(1, room.map(|messages| Window { messages, bytes: 4 << 20 }));
+        let arrived: Vec<_> =
+            (1..=200).map(|number| (receiving.arrive(1, number, 100), receiving.is_ack_overdue())).collect();
+        let first_due =
+            arrived.iter().position(|(arrival, _)| *arrival == Arrival::Take { ack_is_due: true });
+        let first_overdue = arrived.iter().position(|(_, is_overdue)| *is_overdue);
+        assert_eq!((first_due, first_overdue), (Some(due - 1), Some(overdue - 1)), "room: {room:?}");
+        receiving.ack(1, None);
+        assert!(!receiving.is_ack_overdue());
+    }
+}

@@ -106,7 +106,7 @@ pub(crate) fn measure(carrier: &str, packets: usize, pinning: Pinning) {
         zenoh(packets, role)
     } else {
         let at = At::loopback();
-        one_way::run(Carrier::named(carrier), packets, at, &role(&at.host(2).to_string()))
+        one_way::run(Carrier::named(carrier), packets, at, &role(&at.host(2).to_string())).took
     };
     println!("{}", took.as_nanos());
 }

@@ -15,7 +15,7 @@
 //! and on their own threads.
 //!
 //! A flood is one way: 1000 bytes as fast as possible until the last one has arrived; each packet is kept
-//! until it can be sent.
+//! until there is room for it.
 //!
 //! Sinew's applications are those of its own bench, `cargo bench -p sinew --bench gncl`.
 
@@ -29,7 +29,7 @@ mod keys;
 #[allow(dead_code, reason = "the bench has cases in namespaces besides")]
 mod nodes;
 #[path = "../../../actors/benches/gncl/flood.rs"]
-#[allow(dead_code, reason = "the bench has a report of its own")]
+#[allow(dead_code, reason = "the bench has a report of its own, without CPU times")]
 mod one_way;
 mod path;
 #[path = "../../../actors/benches/ping/mod.rs"]

@@ -7,7 +7,10 @@ use actix::{Actor, ActorFutureExt, AsyncContext, Handler, Message, fut};
 use super::AppContext;
 use crate::{
     outcome::{MemberOutcome, Outcome},
-    sender::{Confirmation, Content, GroupConfirmation, MessageBuilder, SendError, Sender, Via},
+    sender::{
+        ConfirmWhenRoom, Confirmation, Content, GroupConfirmation, MessageBuilder, RoomBuilder, SendError,
+        SendWhenRoom, Sender, Via,
+    },
 };
 
 /// The outcome of a message that was sent with [`MessageBuilder::with_tag`].
@@ -135,6 +138,50 @@ impl<'a, A: Actor<Context = AppContext<A>>, C: Content> MessageBuilder<&'a mut A
     pub fn with_tag(self, tag: u64) -> MessageBuilder<Tagged<'a, A>, C> {
         let Self { via, content, terms } = self;
         MessageBuilder { via: Tagged { context: via, tag }, content, terms }
+    }
+}
+
+impl<A: Actor<Context = AppContext<A>>, C: Content> RoomBuilder<&mut AppContext<A>, C> {
+    /// Sends the message when there is room. See [`RoomBuilder::send`] of a [`Sender`]; the future of this one can be
+    /// spawned.
+    ///
+    /// # Errors
+    /// There was no room in time, or the message was refused.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::prelude::*;
+    ///
+    /// payload!("demo.image", Bulk => struct Image { pixels: Vec<u8> });
+    /// struct Camera { is_sending: bool }
+    /// # impl Actor for Camera { type Context = AppContext<Self>; }
+    ///
+    /// /// Sends an image, and takes the next one when this one has left: no queue of old images grows.
+    /// fn send(camera: &mut Camera, image: &Image, ctx: &mut AppContext<Camera>) {
+    ///     if std::mem::replace(&mut camera.is_sending, true) {
+    ///         return;
+    ///     }
+    ///     let sent = ctx.message("vision", image).room_within(Duration::from_millis(200)).send();
+    ///     ctx.spawn(sent.into_actor(camera).map(|sent, camera, _| {
+    ///         camera.is_sending = false;
+    ///         if let Err(error) = sent {
+    ///             eprintln!("an image was skipped: {error}");
+    ///         }
+    ///     }));
+    /// }
+    /// ```
+    pub fn send(self) -> SendWhenRoom<Sender> {
+        self.send_by(|context| Via::sender(&context).clone())
+    }
+
+    /// Sends the message when there is room, and requests a confirmation. See [`RoomBuilder::confirmed`] of a
+    /// [`Sender`]; the future of this one can be spawned.
+    ///
+    /// # Errors
+    /// There was no room in time, the message was refused, or too many outcomes are awaited.
+    pub fn confirmed(self, within: Duration) -> ConfirmWhenRoom<Sender> {
+        self.confirm_by(within, |context| Via::sender(&context).clone())
     }
 }
 

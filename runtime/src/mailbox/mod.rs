@@ -99,6 +99,11 @@ impl Shared {
         RoomWakers { of_messages: self.queue.room_made(), of_events: self.event_waits.take() }
     }
 
+    /// Returns the wakers of the senders that wait for room, which must be notified of another change.
+    fn awaited_no_more(&mut self) -> RoomWakers {
+        RoomWakers { of_messages: self.queue.awaited_no_more(), of_events: self.event_waits.take() }
+    }
+
     /// Removes all queued messages, to be rejected.
     fn empty(&mut self) -> Vec<Message> {
         let waiting = self.queue.drain_all().collect();
@@ -294,32 +299,32 @@ impl Mailbox {
 
     /// Rejects all queued and all new messages.
     pub fn close(&self) {
-        let (waiting, wakers) = {
+        let (waiting, reader, senders) = {
             let mut shared = lock(&self.shared);
             shared.closed = true;
             let mut waiting = shared.take_events();
             waiting.extend(shared.empty());
-            let wakers = [shared.waker.take(), shared.queue.awaited_no_more(), shared.event_waits.take()];
-            (waiting, wakers)
+            (waiting, shared.waker.take(), shared.awaited_no_more())
         };
         for message in waiting {
             self.reject(message, Rejection::Closed);
         }
-        wakers.into_iter().flatten().for_each(Waker::wake);
+        reader.into_iter().for_each(Waker::wake);
+        senders.wake();
     }
 
     /// Rejects all queued and all new messages while the application is down, until
     /// [`accept_again`](Self::accept_again).
     pub fn refuse_while_down(&self) {
-        let (waiting, wakers) = {
+        let (waiting, senders) = {
             let mut shared = lock(&self.shared);
             shared.refuses = true;
-            (shared.empty(), [shared.queue.awaited_no_more(), shared.event_waits.take()])
+            (shared.empty(), shared.awaited_no_more())
         };
         for message in waiting {
             self.reject(message, Rejection::Down);
         }
-        wakers.into_iter().flatten().for_each(Waker::wake);
+        senders.wake();
     }
 
     /// Drops the queued events of layers: the incarnation that they were for has ended.
@@ -389,7 +394,7 @@ impl Mailbox {
     /// Accepts a message that is no event.
     fn take_message(&self, message: Message) -> Result<(), SubmitError> {
         let class = message.header.class as usize;
-        let (mut expired, mut event_waits) = (Vec::new(), None);
+        let (mut expired, mut room) = (Vec::new(), RoomWakers::default());
         let taken = {
             let mut shared = lock(&self.shared);
             if shared.closed {
@@ -404,16 +409,20 @@ impl Mailbox {
                 shared.tallies[class].refused += 1;
                 return Err(SubmitError::new(message, Rejection::Unsupported));
             }
-            if !shared.queue.has_room_for(&message) {
+            self.record_wait(&mut shared);
+            let mut pushed = shared.queue.push(message);
+            if let Err(SubmitError { message, why }) = pushed {
                 // An application that waits for its start takes no messages, so expired ones are removed here
                 // to make room.
                 expired = shared.expire(self.clock.now());
-                if !expired.is_empty() {
-                    event_waits = shared.event_waits.take();
-                }
+                pushed = if expired.is_empty() {
+                    Err(SubmitError::new(message, why))
+                } else {
+                    room = shared.room_made();
+                    shared.queue.push(message)
+                };
             }
-            self.record_wait(&mut shared);
-            match shared.queue.push(message) {
+            match pushed {
                 Ok(superseded) => {
                     shared.tallies[class].taken += 1;
                     shared.tallies[class].superseded += u64::from(superseded.is_some());
@@ -428,7 +437,7 @@ impl Mailbox {
         };
         // Settled and woken without the lock, so that a notified thread does not wait for it.
         expired.iter_mut().for_each(|message| message.settle(Outcome::Expired));
-        event_waits.into_iter().for_each(Waker::wake);
+        room.wake();
         if let Some(waker) = taken? {
             wakes::wake(waker);
         }
@@ -455,13 +464,13 @@ impl MessageSink for Mailbox {
         }
         let Err(refused) = self.take_message(message) else { return Ok(()) };
         if refused.why == Rejection::QueueFull {
-            let waker = {
+            let woken = {
                 let mut shared = lock(&self.shared);
                 // The message is offered again.
                 shared.tallies[refused.message.header.class as usize].refused -= 1;
-                room.and_then(|room| shared.queue.offered(&refused.message, room))
+                room.map_or_else(Vec::new, |room| shared.queue.offered(&refused.message, room))
             };
-            waker.into_iter().for_each(Waker::wake);
+            woken.into_iter().for_each(Waker::wake);
         }
         Err(refused)
     }

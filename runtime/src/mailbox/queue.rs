@@ -72,7 +72,7 @@ pub struct ClassQueue {
     pub(super) budget: Option<Arc<Budget>>,
     /// No queued message expires before this.
     earliest_expiry: Time,
-    /// The waker that waits for room.
+    /// The callers that wait for room, usually none.
     awaited: Option<Awaited>,
 }
 
@@ -154,12 +154,6 @@ impl ClassQueue {
         self.lanes[message.header.class as usize].push_back(message);
     }
 
-    /// Returns whether there is room for this message.
-    #[must_use]
-    pub fn has_room_for(&self, message: &Message) -> bool {
-        self.bounds.has_room_for(message.payload.len(), self.held(message.header.class as usize))
-    }
-
     /// Returns the messages that occupy positions of a lane: those queued in it, and those moved forward from it.
     pub(super) fn held(&self, class: usize) -> Usage {
         let at_ends = self.ends.of_lane(class);
@@ -170,30 +164,49 @@ impl ClassQueue {
     }
 
     /// Registers a caller that keeps this message, which found no room. [`room_made`](Self::room_made) then
-    /// returns its waker when there is room. Returns the waker if there is room already. Only one can be
-    /// registered; a new one replaces it.
-    pub fn offered(&mut self, message: &Message, room: &Waker) -> Option<Waker> {
+    /// returns its waker when there is room. Returns the wakers to be woken now: all if there is room already,
+    /// or the oldest one of too many.
+    #[must_use = "the tasks of these wakers would wait in vain"]
+    pub fn offered(&mut self, message: &Message, room: &Waker) -> Vec<Waker> {
         let (class, length) = (message.header.class, message.payload.len());
-        self.awaited = Some(Awaited::with(self.awaited.take(), class, length, room));
-        self.room_made()
+        let oldest = self.awaited.get_or_insert_default().add(class, length, room);
+        let mut woken = self.room_made();
+        woken.extend(oldest);
+        woken
     }
 
-    /// Returns the registered waker, once there is room: half of the positions of its class, and half of the
-    /// bytes or as many as it needs. Call it after each removal of a message, and wake without a lock.
-    pub fn room_made(&mut self) -> Option<Waker> {
-        let awaited = self.awaited.as_ref()?;
-        let has_room = awaited.any(|class, length| {
-            let held = self.held(class);
-            held.messages <= self.bounds.messages / 2
-                && self.bounds.has_bytes_for(length.max(self.bounds.bytes / 2), held.bytes)
-                && self.budget.as_ref().is_none_or(|budget| budget.has_room_for(length))
+    /// Returns whether a caller waits for room.
+    #[must_use]
+    #[inline]
+    pub const fn is_awaited(&self) -> bool {
+        self.awaited.is_some()
+    }
+
+    /// Returns the registered wakers, once there is room: half of the positions of a class, and half of the
+    /// bytes or as many as its shortest message needs. Call it after each removal of a message, and wake without
+    /// a lock. It costs one load while none is registered.
+    #[must_use = "the tasks of these wakers would wait in vain"]
+    #[inline]
+    pub fn room_made(&mut self) -> Vec<Waker> {
+        if self.awaited.is_none() { Vec::new() } else { self.room_made_for_waiting() }
+    }
+
+    fn room_made_for_waiting(&mut self) -> Vec<Waker> {
+        let has_room = self.awaited.as_ref().is_some_and(|awaited| {
+            awaited.any(|class, length| {
+                let held = self.held(class);
+                held.messages <= self.bounds.messages / 2
+                    && self.bounds.has_bytes_for(length.max(self.bounds.bytes / 2), held.bytes)
+                    && self.budget.as_ref().is_none_or(|budget| budget.has_room_for(length))
+            })
         });
-        if has_room { self.awaited_no_more() } else { None }
+        if has_room { self.awaited_no_more() } else { Vec::new() }
     }
 
-    /// Returns the registered waker, with or without room, because the caller must be notified of another change.
-    pub fn awaited_no_more(&mut self) -> Option<Waker> {
-        self.awaited.take().map(Awaited::into_waker)
+    /// Returns the registered wakers, with or without room, because the callers must be notified of another change.
+    #[must_use = "the tasks of these wakers would wait in vain"]
+    pub fn awaited_no_more(&mut self) -> Vec<Waker> {
+        self.awaited.take().map_or_else(Vec::new, Awaited::into_wakers)
     }
 
     /// Returns whether a newer value of this Stream message is queued.

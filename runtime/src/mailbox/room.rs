@@ -1,30 +1,24 @@
-//! The registration of a waiter for room in a queue, and the wakers of senders that waited.
+//! The registration of waiters for room in a queue, and the wakers of senders that waited.
 
 use std::task::Waker;
 
-use crate::wire::Class;
+use crate::{WakerList, wire::Class};
 
-/// A caller that keeps messages for a full queue, to be woken when it has room for one of them.
-#[derive(Debug)]
+/// The callers that keep messages for a full queue, to be woken together when it has room for one of them.
+#[derive(Debug, Default)]
 pub(super) struct Awaited {
     /// For each class, the payload length in bytes of the shortest message that waits, if any does.
     shortest: [Option<usize>; 3],
-    waker: Waker,
+    wakers: WakerList,
 }
 
 impl Awaited {
-    /// Adds a message of this class and length to the messages that `former` waited for, and replaces its waker.
-    pub(super) fn with(former: Option<Self>, class: Class, length: usize, waker: &Waker) -> Self {
-        let mut awaited = match former {
-            Some(mut former) => {
-                former.waker.clone_from(waker);
-                former
-            }
-            None => Self { shortest: [None; 3], waker: waker.clone() },
-        };
-        let shortest = &mut awaited.shortest[class as usize];
+    /// Adds a caller that keeps a message of this class and length. Returns a caller to be woken in its place, if
+    /// there are too many.
+    pub(super) fn add(&mut self, class: Class, length: usize, waker: &Waker) -> Option<Waker> {
+        let shortest = &mut self.shortest[class as usize];
         *shortest = Some(shortest.map_or(length, |shorter| shorter.min(length)));
-        awaited
+        self.wakers.add(waker)
     }
 
     /// Returns whether `has_room` is true for a class and the length of its shortest message.
@@ -33,15 +27,15 @@ impl Awaited {
         awaited.any(|(class, shortest)| shortest.is_some_and(|length| has_room(class, length)))
     }
 
-    pub(super) fn into_waker(self) -> Waker {
-        self.waker
+    pub(super) fn into_wakers(mut self) -> Vec<Waker> {
+        self.wakers.take()
     }
 }
 
 /// The wakers of the senders that a removal has made room for: usually none.
 #[derive(Default)]
 pub(super) struct RoomWakers {
-    pub(super) of_messages: Option<Waker>,
+    pub(super) of_messages: Vec<Waker>,
     pub(super) of_events: Option<Waker>,
 }
 
@@ -49,12 +43,13 @@ impl RoomWakers {
     /// Wakes them. The caller holds no lock.
     #[inline]
     pub(super) fn wake(self) {
-        if let Some(waker) = self.of_messages {
-            waker.wake();
+        if !self.of_messages.is_empty() || self.of_events.is_some() {
+            self.wake_all();
         }
-        if let Some(waker) = self.of_events {
-            waker.wake();
-        }
+    }
+
+    fn wake_all(self) {
+        self.of_messages.into_iter().chain(self.of_events).for_each(Waker::wake);
     }
 }
 
@@ -116,6 +111,26 @@ mod tests {
         assert_eq!(after_each, [0, 1, 1, 1]);
         let tally = mailbox.tally(Class::Control);
         assert_eq!((tally.taken, tally.refused), (4, 0), "what is offered again is not refused");
+    }
+
+    #[test]
+    fn all_waiting_senders_are_woken_once_together() {
+        let woken: Vec<_> = (0..3).map(|_| Arc::<Woken>::default()).collect();
+        let mailbox = Mailbox::new(4);
+        let mut reader = mailbox.attach();
+        (0..4).for_each(|_| mailbox.submit(message()).unwrap());
+        for (round, woken) in woken.iter().chain(&woken).enumerate() {
+            // The second round is of the same tasks.
+            let refused = mailbox.offer(message(), Some(&Waker::from(woken.clone()))).unwrap_err();
+            assert_eq!(refused.why, Rejection::QueueFull, "round {round}");
+        }
+        let times = || woken.iter().map(|woken| woken.0.load(Ordering::Relaxed)).collect::<Vec<_>>();
+        assert!(takes(&mut reader));
+        assert_eq!(times(), [0; 3]);
+        assert!(takes(&mut reader));
+        assert_eq!(times(), [1; 3]);
+        assert!(takes(&mut reader) && takes(&mut reader));
+        assert_eq!(times(), [1; 3]);
     }
 
     #[test]

@@ -16,8 +16,8 @@ pub trait MessageSink: Send + Sync {
     fn submit(&self, message: Message) -> Result<(), SubmitError>;
 
     /// Same as [`submit`](Self::submit), for a caller that keeps a message after a full queue and offers it
-    /// again: this does not count as a rejection. `room` is woken, once, when a full queue has room again; of
-    /// several waiting wakers, only the last one. A sink that cannot detect that wakes none.
+    /// again: this does not count as a rejection. `room` is woken, once, when a full queue has room again. All
+    /// waiting callers are woken together. A sink that cannot detect room wakes none.
     ///
     /// # Errors
     /// Those of `submit`.

@@ -148,14 +148,15 @@ impl Terms {
 }
 
 impl<V: Via, C: Content> MessageBuilder<V, C> {
-    fn message(self) -> Result<(V, Message), SendError> {
+    pub(super) fn message(self) -> Result<(V, Message), SendError> {
         let Self { via, content, terms } = self;
         let mut message = content.into_message(via.sender())?;
         terms.apply(&mut message);
         Ok((via, message))
     }
 
-    /// Sends the message without a confirmation. Returns when a queue or a socket has accepted it.
+    /// Sends the message without a confirmation. Returns when a queue or a socket has accepted it. A full queue refuses
+    /// it; [`room_within`](Self::room_within) waits.
     ///
     /// # Errors
     /// No queue and no socket accepted the message.
@@ -299,6 +300,6 @@ impl<C: Content> MessageBuilder<&Sender, C> {
 }
 
 /// Returns whether a message to `destination` has several outcomes.
-fn is_many(destination: Tid) -> bool {
+pub(super) fn is_many(destination: Tid) -> bool {
     !destination.is_single() && destination.app != AppAddress::NONE
 }

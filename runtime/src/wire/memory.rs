@@ -2,12 +2,16 @@
 //!
 //! A payload is shared by reference count, so dropping its last reference on any thread frees its buffer:
 //! nothing is sent back. A payload that is kept for long keeps its buffer. The thread then creates others, up
-//! to a bound; after that, memory is allocated for each payload. Copies of a burst share a buffer, which is reused
-//! when all of them have ended.
+//! to a bound; after that, memory is allocated, for each payload or for several together. Copies of a burst share
+//! a buffer, which is reused when all of them have ended.
+
+#[cfg(test)]
+mod tests;
 
 use std::{
     cell::RefCell,
     io::{self, Write},
+    ops::RangeInclusive,
 };
 
 use bytes::{Bytes, BytesMut};
@@ -28,12 +32,26 @@ const IN_TURN: usize = 8;
 /// Number of payloads for which the next buffer in turn is checked before the first few, after a payload that
 /// found these used. A session keeps each payload until it is acknowledged, so they are used nearly always.
 const CROWDED: u8 = 16;
+/// Number of payloads with memory of their own or shared memory before the buffers are searched again. In a flood a
+/// session keeps hundreds of payloads, and a search finds none of the buffers free.
+const FULL: u8 = 16;
 /// Least initial bytes of an allocation for one payload.
 const SHORT: usize = 128;
+/// Lengths in bytes of the payloads that share an allocation of [`BUFFER_BYTES`] while all buffers are used: two to
+/// eight of them. A shorter one that is kept for long would keep many times its own length.
+const SHARED: RangeInclusive<usize> = BUFFER_BYTES / 8..=BUFFER_BYTES / 2;
 
 thread_local! {
     static BUFFERS: RefCell<Buffers> = const {
-        RefCell::new(Buffers { all: Vec::new(), next: FIRST, crowded: 0, last_copied: 0, alone: [SHORT; 2] })
+        RefCell::new(Buffers {
+            all: Vec::new(),
+            next: FIRST,
+            crowded: 0,
+            full: 0,
+            last_copied: 0,
+            shared: None,
+            alone: [SHORT; 2],
+        })
     };
 }
 
@@ -87,7 +105,7 @@ impl Write for Writer {
     #[inline]
     fn write_all(&mut self, bytes: &[u8]) -> io::Result<()> {
         let length = self.0.memory.len() + bytes.len();
-        if length > BUFFER_BYTES && self.0.place.is_some() {
+        if length > self.0.memory.capacity() && self.0.home != Home::Payload {
             self.0 = self.0.outgrown(length);
         }
         self.0.memory.extend_from_slice(bytes);
@@ -102,8 +120,18 @@ impl Write for Writer {
 /// A buffer in use. It returns to its thread when this is dropped, also after a panic of the payload's own code.
 struct Buffer {
     memory: BytesMut,
-    /// The index of the buffer in its thread; `None` if it belongs to no thread, and grows as needed.
-    place: Option<usize>,
+    home: Home,
+}
+
+/// The owner of a buffer's memory.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Home {
+    /// The thread, which has the buffer at this index.
+    Place(usize),
+    /// The thread, for several payloads.
+    Shared,
+    /// The payload alone; the memory grows as needed.
+    Payload,
 }
 
 impl Buffer {
@@ -119,13 +147,13 @@ impl Buffer {
             Ok(Err(length)) => length,
             Err(_) => SHORT,
         };
-        Self { memory: BytesMut::with_capacity(length), place: None }
+        Self { memory: BytesMut::with_capacity(length), home: Home::Payload }
     }
 
     /// Returns a buffer of the thread, if one is free.
     fn of_thread() -> Option<Self> {
         // A thread at its end may have destroyed this variable.
-        BUFFERS.try_with(|buffers| buffers.borrow_mut().take()).ok().flatten()
+        BUFFERS.try_with(|buffers| buffers.borrow_mut().take_own()).ok().flatten()
     }
 
     /// Returns new memory with the bytes written so far, and room for `length` bytes in all.
@@ -133,28 +161,31 @@ impl Buffer {
     fn outgrown(&self, length: usize) -> Self {
         let mut memory = BytesMut::with_capacity(length);
         memory.extend_from_slice(&self.memory);
-        Self { memory, place: None }
+        Self { memory, home: Home::Payload }
     }
 
     /// Splits off the written bytes. They keep the buffer from being reused while they exist.
     fn cut(&mut self) -> BytesMut {
-        if self.place.is_some() {
-            return self.memory.split();
-        }
-        let memory = std::mem::take(&mut self.memory);
+        let written = match self.home {
+            Home::Place(_) => return self.memory.split(),
+            Home::Shared => self.memory.split(),
+            Home::Payload => std::mem::take(&mut self.memory),
+        };
         // A thread at its end may have destroyed this variable.
-        let _ = BUFFERS.try_with(|buffers| buffers.borrow_mut().note_alone(memory.len()));
-        memory
+        let _ = BUFFERS.try_with(|buffers| buffers.borrow_mut().note_alone(written.len()));
+        written
     }
 }
 
 impl Drop for Buffer {
     fn drop(&mut self) {
-        let Some(place) = self.place else { return };
+        if self.home == Home::Payload {
+            return;
+        }
         let mut memory = std::mem::take(&mut self.memory);
         memory.clear();
         // A thread at its end may have destroyed this variable.
-        let _ = BUFFERS.try_with(|buffers| buffers.borrow_mut().all[place] = memory);
+        let _ = BUFFERS.try_with(|buffers| buffers.borrow_mut().put_back(self.home, memory));
     }
 }
 
@@ -166,9 +197,13 @@ struct Buffers {
     next: usize,
     /// The number of payloads for which that one is checked before the first few.
     crowded: u8,
+    /// The number of payloads for which no buffer is searched.
+    full: u8,
+    /// The rest of the memory that several payloads share.
+    shared: Option<BytesMut>,
     /// The buffer of the last copied payload.
     last_copied: usize,
-    /// The lengths in bytes of the last two payloads with memory of their own.
+    /// The lengths in bytes of the last two payloads that were written to no buffer.
     alone: [usize; 2],
 }
 
@@ -184,15 +219,49 @@ impl Buffers {
         self.alone = [length, self.alone[0]];
     }
 
-    /// Takes a buffer, while code of the payload's type writes to it.
+    /// Takes a buffer or shared memory, while code of the payload's type writes to it.
     fn take(&mut self) -> Option<Buffer> {
+        self.take_own().or_else(|| {
+            let memory = self.take_shared(self.expected_length())?;
+            Some(Buffer { memory, home: Home::Shared })
+        })
+    }
+
+    /// Takes a buffer.
+    fn take_own(&mut self) -> Option<Buffer> {
         let place = self.place()?;
-        Some(Buffer { memory: std::mem::take(&mut self.all[place]), place: Some(place) })
+        Some(Buffer { memory: std::mem::take(&mut self.all[place]), home: Home::Place(place) })
+    }
+
+    /// Takes the memory that payloads share, with room for `length` bytes; `None` if no payload of this length shares
+    /// memory. Former memory without room is freed with its last payload.
+    fn take_shared(&mut self, length: usize) -> Option<BytesMut> {
+        let has_room = |memory: &BytesMut| memory.capacity() >= length;
+        SHARED.contains(&length).then(|| {
+            self.shared.take().filter(has_room).unwrap_or_else(|| BytesMut::with_capacity(BUFFER_BYTES))
+        })
+    }
+
+    /// Takes memory back. While code of a payload sends another one, two have shared memory: that with more room stays.
+    fn put_back(&mut self, home: Home, memory: BytesMut) {
+        match home {
+            Home::Place(place) => self.all[place] = memory,
+            Home::Shared if self.shared.as_ref().is_none_or(|other| other.capacity() < memory.capacity()) => {
+                self.shared = Some(memory);
+            }
+            Home::Shared | Home::Payload => {}
+        }
     }
 
     /// Returns a copy of these bytes, at most [`BUFFER_BYTES`]. The buffer stays at its place.
     fn copied(&mut self, bytes: &[u8]) -> Option<Bytes> {
-        let place = self.place_of_copy(bytes.len())?;
+        let Some(place) = self.place_of_copy(bytes.len()) else {
+            let mut memory = self.take_shared(bytes.len())?;
+            memory.extend_from_slice(bytes);
+            let copy = memory.split().freeze();
+            self.shared = Some(memory);
+            return Some(copy);
+        };
         self.last_copied = place;
         let memory = &mut self.all[place];
         memory.extend_from_slice(bytes);
@@ -202,21 +271,33 @@ impl Buffers {
     /// Returns the index of a buffer with room for `length` bytes. While the first few are used, the buffer of the
     /// last copy is filled to its end, because the copies of a burst mostly end together.
     fn place_of_copy(&mut self, length: usize) -> Option<usize> {
+        let last_has_room = self.all.get(self.last_copied).is_some_and(|memory| memory.capacity() >= length);
+        if self.full > 0 {
+            self.full -= 1;
+            return last_has_room.then_some(self.last_copied);
+        }
         if self.crowded == 0
             && let Some(first) = self.first_free()
         {
             return Some(first);
         }
-        if self.all.get(self.last_copied).is_some_and(|memory| memory.capacity() >= length) {
+        if last_has_room {
             self.crowded = self.crowded.checked_sub(1).unwrap_or(CROWDED);
             return Some(self.last_copied);
         }
         self.place()
     }
 
-    /// Returns the index of a free buffer, or of a new one below the maximum.
+    /// Returns the index of a free buffer, or of a new one below the maximum. After a search that found none, there
+    /// is none for the next few payloads.
     fn place(&mut self) -> Option<usize> {
-        self.free().or_else(|| self.added())
+        if self.full > 0 {
+            self.full -= 1;
+            return None;
+        }
+        let place = self.free().or_else(|| self.added());
+        self.full = if place.is_none() { FULL } else { 0 };
+        place
     }
 
     fn free(&mut self) -> Option<usize> {
@@ -255,162 +336,5 @@ impl Buffers {
             self.all.push(BytesMut::with_capacity(BUFFER_BYTES));
             place
         })
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use std::collections::{HashSet, VecDeque};
-
-    use super::*;
-
-    fn payload(byte: u8, length: usize) -> Bytes {
-        written(|writer| writer.write_all(&vec![byte; length])).unwrap()
-    }
-
-    fn buffers() -> usize {
-        BUFFERS.with(|buffers| buffers.borrow().all.len())
-    }
-
-    #[test]
-    fn freed_payload_memory_is_reused() {
-        let first = payload(1, 1000);
-        let place = first.as_ptr();
-        drop(first);
-        assert_eq!(payload(2, 4096).as_ptr(), place);
-        assert_eq!(zeroed(8).as_ptr(), place);
-        assert_eq!(copied(&[1; 4096]).as_ptr(), place);
-    }
-
-    #[test]
-    fn live_payloads_never_share_memory() {
-        let mut kept = Vec::new();
-        for round in 0..3 {
-            kept.extend((0..BUFFERS_MAX + 9).map(|n| payload(n as u8, 1 + n * 67)));
-            kept.extend((0..9).map(|n| payload(n as u8, 2 * BUFFER_BYTES)));
-            kept.extend((0..9).map(|n| copied(&[n as u8; 100])));
-            for (n, payload) in kept.iter().enumerate() {
-                assert!(payload.iter().all(|byte| *byte == payload[0]), "payload {n} in round {round}");
-            }
-            assert_eq!(buffers(), BUFFERS_MAX);
-            // Each third one ends, so that free buffers lie between used ones.
-            let mut number = 0;
-            kept.retain(|_| {
-                number += 1;
-                number % 3 > 0
-            });
-        }
-    }
-
-    #[test]
-    fn few_payloads_at_once_use_few_buffers() {
-        let mut in_hand = payload(0, 10);
-        for n in 1..100 {
-            in_hand = payload(n, in_hand.len());
-        }
-        assert_eq!(buffers(), 2);
-    }
-
-    #[test]
-    fn first_buffers_are_used_again_after_a_crowd() {
-        let mut live: VecDeque<_> = (0..10).map(|_| payload(1, 1000)).collect();
-        let first: Vec<_> = live.iter().take(FIRST).map(|payload| payload.as_ptr()).collect();
-        for _ in 0..100 {
-            live.push_back(payload(2, 1000));
-            live.pop_front();
-        }
-        assert_eq!(buffers(), 11, "a free one was not found");
-        live.clear();
-        for _ in 0..CROWDED {
-            let _ = payload(3, 1000);
-        }
-        assert!(first.contains(&payload(4, 1000).as_ptr()));
-    }
-
-    #[test]
-    fn copies_of_a_burst_share_buffers() {
-        let copies: Vec<_> = (0..200).map(|n| copied(&[n; 1000])).collect();
-        assert!(copies.iter().zip(0..).all(|(copy, n)| copy[..] == [n; 1000]));
-        assert!(buffers() < 60, "{} buffers for 200 copies, of which four fit in each", buffers());
-        // A buffer is free only after its last copy.
-        let (places, all) = (copies.iter().map(|copy| copy.as_ptr()).collect::<HashSet<_>>(), buffers());
-        let kept: Vec<_> = copies.into_iter().skip(3).step_by(4).collect();
-        let later: Vec<_> = (0..100).map(|_| copied(&[9; 1000])).collect();
-        assert!(kept.iter().zip((3..).step_by(4)).all(|(copy, n)| copy[..] == [n; 1000]));
-        assert!(places.len() == 200 && later.iter().all(|copy| copy[..] == [9; 1000]) && buffers() >= all);
-        drop((kept, later));
-        for _ in 0..=CROWDED {
-            let _ = copied(&[1; 1000]);
-        }
-        let place = copied(&[1; 1000]).as_ptr();
-        assert_eq!(copied(&[1; 1000]).as_ptr(), place, "a single copy uses the first buffer again");
-    }
-
-    #[test]
-    fn free_buffer_is_found_between_used_ones() {
-        let mut all: Vec<_> = (0..BUFFERS_MAX).map(|_| payload(1, 1000)).collect();
-        let places: HashSet<_> = all.iter().map(|payload| payload.as_ptr()).collect();
-        let mut place = 0;
-        all.retain(|_| {
-            place += 1;
-            place <= FIRST || place % IN_TURN != 0
-        });
-        for _ in all.len()..BUFFERS_MAX {
-            all.push(payload(2, 1000));
-        }
-        assert!(
-            all.iter().all(|payload| places.contains(&payload.as_ptr())),
-            "memory was allocated while a buffer was free"
-        );
-    }
-
-    #[test]
-    fn payloads_beyond_the_buffers_get_the_memory_they_need() {
-        let _used: Vec<_> = (0..BUFFERS_MAX).map(|_| payload(1, 1000)).collect();
-        let capacity = || {
-            let writer = Writer(Buffer::take());
-            assert!(writer.0.place.is_none());
-            writer.0.memory.capacity()
-        };
-        assert_eq!(capacity(), SHORT);
-        let _first = payload(1, 1000);
-        assert_eq!(capacity(), SHORT, "a single long one");
-        let _second = payload(1, 900);
-        assert_eq!(capacity(), 900);
-        let _short = payload(1, 10);
-        assert_eq!(capacity(), SHORT);
-        let _long = [payload(1, 100_000), payload(1, 100_000)];
-        assert_eq!(capacity(), BUFFER_BYTES);
-    }
-
-    #[test]
-    fn payload_of_any_length_round_trips() {
-        for length in [0, 1, BUFFER_BYTES - 1, BUFFER_BYTES, BUFFER_BYTES + 1, 100_000] {
-            let bytes: Vec<u8> = (0..length).map(|n| n as u8).collect();
-            let (head, tail) = bytes.split_at(length / 3);
-            let payload = written(|writer| writer.write_all(head).and_then(|()| writer.write_all(tail)));
-            assert_eq!(payload.unwrap(), bytes);
-            assert_eq!(zeroed(length), vec![0; length]);
-            assert_eq!(copied(&bytes), bytes);
-        }
-        assert_eq!(buffers(), 1);
-    }
-
-    #[test]
-    fn payload_code_that_sends_or_panics_leaks_no_buffer() {
-        let outer = written(|writer| {
-            writer.write_all(b"outer")?;
-            assert_eq!(payload(7, 3), [7, 7, 7][..]);
-            writer.write_all(b" whole")
-        });
-        assert_eq!(outer.unwrap(), b"outer whole"[..]);
-        let panics =
-            || written(|writer| writer.write_all(b"lost").map(|()| panic!("a fault of the payload's")));
-        for _ in 0..9 {
-            let panicked = std::panic::catch_unwind(|| panics().map_err(|error: io::Error| error.kind()));
-            assert!(panicked.is_err());
-        }
-        assert_eq!(payload(1, 2), [1, 1][..]);
-        assert_eq!(buffers(), 2);
     }
 }

@@ -4,9 +4,13 @@ use std::{
     io::{BufRead, BufReader, Read},
     os::fd::OwnedFd,
     process::{Child, ChildStdout, Command, Stdio},
+    time::Duration,
 };
 
-use rustix::process::{Pid, Signal, kill_process};
+use rustix::{
+    process::{Pid, Signal, kill_process},
+    time::{ClockId, clock_gettime},
+};
 
 /// The environment variable that selects the role of a bench's program.
 const ROLE: &str = "SINEW_BENCH_ROLE";
@@ -95,6 +99,15 @@ impl Process {
         sleeps_of(&self.child.id().to_string())
     }
 
+    /// The next line of its output, which is a time as of [`print_time`].
+    ///
+    /// # Panics
+    /// If it is another line, or the process has exited.
+    pub fn time(&mut self) -> Duration {
+        let line = self.line();
+        Duration::from_nanos(line.parse().unwrap_or_else(|_| panic!("no nanoseconds: `{line}`")))
+    }
+
     /// The next line of its output. At the end of the output the line is empty.
     ///
     /// # Panics
@@ -149,6 +162,18 @@ fn sleeps_of(process: &str) -> u64 {
 fn counted(status: &str) -> Option<u64> {
     let line = status.lines().find_map(|line| line.strip_prefix("voluntary_ctxt_switches:"))?;
     line.trim().parse().ok()
+}
+
+/// CPU time of this process so far, with all its threads.
+#[must_use]
+pub fn cpu_time() -> Duration {
+    let time = clock_gettime(ClockId::ProcessCPUTime);
+    Duration::new(time.tv_sec as u64, time.tv_nsec as u32)
+}
+
+/// Prints a time for the parent process.
+pub fn print_time(time: Duration) {
+    println!("{}", time.as_nanos());
 }
 
 /// Tells the parent process that this process is ready.

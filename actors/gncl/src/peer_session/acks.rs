@@ -1,9 +1,9 @@
 //! The acknowledgements sent to a peer.
 
-use std::sync::atomic::Ordering;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use sinew_runtime::wire::{Kind, Message};
-use sinew_session::Ack;
+use sinew_session::{Ack, Receiving};
 
 use super::{Inbox, PeerSession};
 use crate::{core::write, frame::frame};
@@ -23,12 +23,49 @@ struct Acknowledgement {
     message: Message,
 }
 
+/// The frames behind those that were read together.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum FramesBehind {
+    /// More bytes have probably arrived, and are read next.
+    Likely,
+    /// The reader waits for more.
+    None,
+}
+
+/// Whether an acknowledgement must be sent after the frames that were read together. Written with the inbox locked.
+/// SYNC: Relaxed; a reader without that lock asks for the marks of its own thread.
+#[derive(Debug, Default)]
+pub(super) struct AckMarks {
+    is_due: AtomicBool,
+    /// Whether it must be sent although more frames have arrived.
+    is_overdue: AtomicBool,
+}
+
+impl AckMarks {
+    /// Marks an acknowledgement as due.
+    pub(super) fn set_due(&self, receiving: &Receiving) {
+        self.is_due.store(true, Ordering::Relaxed);
+        self.is_overdue.store(receiving.is_ack_overdue(), Ordering::Relaxed);
+    }
+
+    /// Records that an acknowledgement was created.
+    fn clear(&self) {
+        self.is_due.store(false, Ordering::Relaxed);
+        self.is_overdue.store(false, Ordering::Relaxed);
+    }
+}
+
 impl PeerSession {
-    /// Sends an acknowledgement, if one is due after the frames read together were processed.
-    pub(crate) fn acknowledge_if_due(&self) {
+    /// Sends an acknowledgement, if one is due after the frames read together were processed. In a flood it waits for
+    /// the frames behind, up to a bound: each one wakes a thread of the peer.
+    pub(crate) fn acknowledge_if_due(&self, behind: FramesBehind) {
+        let mark = match behind {
+            FramesBehind::Likely => &self.ack_marks.is_overdue,
+            FramesBehind::None => &self.ack_marks.is_due,
+        };
         // SYNC: Relaxed; this thread has processed the frames. The mark of another thread may be missed here: it
         // has requested a check.
-        if self.ack_is_due.load(Ordering::Relaxed) {
+        if mark.load(Ordering::Relaxed) {
             self.acknowledge();
         }
     }
@@ -37,7 +74,7 @@ impl PeerSession {
     pub(crate) fn acknowledge_pending(&self) -> bool {
         let is_pending = {
             let inbox = self.inbox();
-            self.ack_is_due.load(Ordering::Relaxed) || inbox.receiving.has_unacknowledged()
+            self.ack_marks.is_due.load(Ordering::Relaxed) || inbox.receiving.has_unacknowledged()
         };
         if is_pending {
             self.acknowledge();
@@ -72,7 +109,7 @@ impl PeerSession {
         // The acknowledgement at hand is not sent, because it may be older than one sent meanwhile.
         {
             let _inbox = self.inbox();
-            self.ack_is_due.store(true, Ordering::Relaxed);
+            self.ack_marks.is_due.store(true, Ordering::Relaxed);
         }
         self.notifiers.acks.request();
     }
@@ -81,7 +118,7 @@ impl PeerSession {
         let epoch = self.outlet.epoch();
         let (ack, number, link) = {
             let Inbox { receiving, backlog, acks_made, .. } = &mut *self.inbox();
-            self.ack_is_due.store(false, Ordering::Relaxed);
+            self.ack_marks.clear();
             *acks_made += 1;
             let room = backlog.room(self.window, self.longest);
             let ack = receiving.ack(epoch, Some(room));

@@ -20,6 +20,11 @@ impl<'a> ProcessingGuard<'a> {
         }
     }
 
+    /// Leaves it to the caller to record the disposition of the message. It counts as in process until then.
+    pub(crate) fn defer(mut self) {
+        self.0 = None;
+    }
+
     /// Uncounts a message that had arrived before.
     pub(crate) fn drop_duplicate(mut self) {
         if let Some(session) = self.0.take() {

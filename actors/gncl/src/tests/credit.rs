@@ -1,14 +1,14 @@
 //! Applications that read nothing: their senders are held, all others are not. No message is lost, duplicated or
 //! reordered.
 
-use std::{future::poll_fn, sync::Arc};
+use std::{future::poll_fn, sync::Arc, task::Poll};
 
 use futures_util::{FutureExt, StreamExt};
 use sinew_runtime::{
     event_queue::EventStream,
     mailbox::Mailbox,
     outcome::{Outcome, Rejection},
-    router::LocalRoute,
+    router::{LocalRoute, MessageSink as _},
     tid::Tid,
     time::Time,
     wire::{Class, Flags, Kind, Message},
@@ -412,5 +412,35 @@ fn held_list_fits_a_node_with_short_messages() {
         .await;
         let refused = a.state.store.refusals.by_cause();
         assert!(refused.iter().all(|(cause, _)| *cause != "violation"), "{refused:?}");
+    });
+}
+
+#[test]
+fn sender_that_waits_for_room_is_woken_when_the_slow_application_takes_messages() {
+    run(async {
+        // Given: everything on the way to the slow application is full, and a task that keeps one more message
+        let (a, b, mut slow) = pair().await;
+        let taken = fill(&a, &b).await;
+        let peer = a.state.store.peer(b.address()).expect("it is linked");
+        let mut kept = Some(bulk(&a, b.tid(1), taken));
+        let waits = tokio::spawn(poll_fn(move |cx| {
+            let Some(message) = kept.take() else { return Poll::Pending };
+            match peer.offer(message, Some(cx.waker())) {
+                Ok(()) => Poll::Ready(()),
+                Err(refused) => {
+                    assert_eq!(refused.why, Rejection::QueueFull);
+                    kept = Some(refused.message);
+                    Poll::Pending
+                }
+            }
+        }));
+        tokio::task::yield_now().await;
+        assert!(!waits.is_finished());
+        // When, then
+        for number in 0..=taken {
+            let message = next("a message for the slow one", &mut slow).await;
+            assert_eq!(message.payload[..], number.to_le_bytes());
+        }
+        within("the task to end", waits).await.expect("it does not panic");
     });
 }

@@ -362,8 +362,8 @@ fn datagram_state_of_a_former_connection_is_ignored() {
         let say_on = |lane, link| {
             let (state, peer) = (node.state.clone(), peer.clone());
             let (spin, checksum, outcomes) = (Arc::default(), Checksum::Crc, RefCell::default());
-            let conversion = Cell::default();
-            let inbound = Inbound { state, peer, spin, lane, link, checksum, outcomes, conversion };
+            let (conversion, former) = (Cell::default(), Cell::default());
+            let inbound = Inbound { state, peer, spin, lane, link, checksum, outcomes, conversion, former };
             let said = Announcement { port: 1, key: KEY, address: 0 };
             inbound.receive(Time::now(), frame(NINE, node.address(), Kind::GNCL_DATAGRAMS, write(&said)))
         };

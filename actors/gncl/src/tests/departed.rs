@@ -58,7 +58,7 @@ fn receive_message(node: &Node, peer: &Arc<Peer>) -> Message {
     let mut message = node.message(node.tid(1), b"said");
     message.header.source.node = NINE;
     (message.header.number, message.header.correlation) = (1, 1);
-    let taken = session(peer).on_message(LinkNumber::default(), &message);
+    let taken = session(peer).on_message(LinkNumber::default(), &message, None);
     assert_eq!(taken.expect("it is the next one"), Admission::Deliver);
     message.receipt = Some(Receipt::new(peer.clone(), message.ticket()));
     message
@@ -184,5 +184,35 @@ fn keeper_is_notified_when_an_ended_incarnation_is_idle() {
         node.start_layer().await;
         let account = account_after_all(&node, 1).await;
         assert_eq!(account.rejected, 1);
+    });
+}
+
+#[test]
+fn disposition_is_recorded_with_the_next_message() {
+    run(async {
+        // Given: a first message, of which the disposition is not recorded yet
+        let (mut node, _inbox) = full().await;
+        node.stop_layer();
+        let is_told = || node.state.store.queues_changed.notified().now_or_never().is_some();
+        let peer = create_incarnation(&node, 1);
+        let mut message = receive_message(&node, &peer);
+        drop(message.receipt.take());
+        let session = session(&peer);
+        let counts = || {
+            let arrived = session.account().arrived;
+            (arrived.taken, arrived.forwarded, arrived.waiting)
+        };
+        assert_eq!(counts(), (1, 0, 1));
+        // When, then
+        message.header.number = 2;
+        let taken = session.on_message(LinkNumber::default(), &message, Some(Disposition::Forwarded));
+        assert_eq!((taken.expect("it is the next one"), counts()), (Admission::Deliver, (2, 1, 1)));
+        // And: also if the peer has ended meanwhile, and with a notification.
+        session.fence();
+        is_told();
+        message.header.number = 3;
+        let taken = session.on_message(LinkNumber::default(), &message, Some(Disposition::Forwarded));
+        assert_eq!((taken.expect("nothing is checked"), counts()), (Admission::Drop, (2, 2, 0)));
+        assert!(is_told());
     });
 }

@@ -29,8 +29,8 @@ const RIGHT_BEHIND: Duration = Duration::from_micros(2);
 /// Pause after which a bursting sender may write one message at once: an interrupted burst continues.
 const PAUSE: Duration = Duration::from_micros(50);
 /// Bytes that are gathered before they are written: the amount that a sender [writes
-/// itself](super::draining), plus one message.
-const GATHERED_MAX: usize = 40 << 10;
+/// itself](super::draining), plus one message. No piece of a frame is longer.
+const GATHERED_MAX: usize = 64 << 10;
 
 /// Longest frame, in bytes, that is gathered with others rather than written alone.
 pub(super) const SHORT: usize = 4 << 10;
@@ -154,9 +154,13 @@ impl<S: Socket> Socket for Gathering<S> {
         true
     }
 
+    fn gather_room(&self) -> usize {
+        GATHERED_MAX.saturating_sub(self.bytes.len())
+    }
+
     fn gather(&mut self, parts: &[IoSlice<'_>]) -> bool {
         let length: usize = parts.iter().map(|part| part.len()).sum();
-        let has_room = self.bytes.len() + length <= GATHERED_MAX;
+        let has_room = length <= self.gather_room();
         if has_room {
             parts.iter().for_each(|part| self.bytes.extend_from_slice(part));
         }

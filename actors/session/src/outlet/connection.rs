@@ -1,17 +1,18 @@
 //! The current connection of an outlet: its socket, the frame that is being written, and the drain task.
 
 use std::{
-    io,
+    io::{self, IoSlice},
     task::{Context, Poll, Waker},
 };
 
 use sinew_runtime::{
     outcome::Rejection,
-    wire::{Checksum, Header},
+    wire::{Checksum, Header, Message},
 };
 
 use super::{
     Account, LinkNumber, Socket, Taking,
+    batch::SHORT,
     deferred::DeferredActions,
     partial::{FrameOrigin, Partial, Written},
     progress::is_for_the_program,
@@ -134,6 +135,26 @@ impl<S: Socket> Connection<S> {
         match frame.write_to(socket) {
             Ok(written) => written,
             Err(error) => self.note(error),
+        }
+    }
+
+    /// Bytes of frames that the socket has room to gather.
+    pub(super) fn gather_room(&self) -> usize {
+        if let Link::Up(socket) = &self.link { socket.gather_room() } else { 0 }
+    }
+
+    /// Whether the gathered bytes leave no room for every short frame, so that they are written now: the frame that
+    /// finds no room would be written alone.
+    pub(super) fn is_gathered_full(&self) -> bool {
+        self.gathered() > 0 && self.gather_room() < SHORT
+    }
+
+    /// Lets the socket gather the frame of a message, for which it has [room](Self::gather_room).
+    pub(super) fn gather_message(&mut self, message: &Message) {
+        if let Link::Up(socket) = &mut self.link {
+            let head = socket.checksum().encode(&message.header, &message.payload);
+            let is_gathered = socket.gather(&[IoSlice::new(&head), IoSlice::new(&message.payload)]);
+            debug_assert!(is_gathered, "there was room");
         }
     }
 

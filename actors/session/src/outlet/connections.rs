@@ -77,7 +77,7 @@ impl<S: Socket> WriterState<S> {
         self.settle_unknown(deferred);
         self.counters.lose_numbered(self.numbering.forget());
         self.connection.close(why);
-        deferred.room.extend(self.unsent.queue.awaited_no_more());
+        deferred.room.extend(self.unsent.awaited_no_more());
         self.lose_unsent(Outcome::PeerLost, deferred);
         self.receipts.clear_waiting();
     }

@@ -25,8 +25,9 @@ const WRITES_PER_WAKE: usize = 64;
 /// Bytes that the drain task writes before it yields.
 const BYTES_PER_WAKE: usize = 64 << 10;
 
-/// Queued bytes of short frames at which a sender writes them itself, all at once.
-const HELP_AT_BYTES: usize = 32 << 10;
+/// Queued bytes of short frames at which a sender writes them itself, all at once: as many as a receiver reads in a
+/// turn. A write has a fixed cost at both ends, for the system call and perhaps a wake.
+const HELP_AT_BYTES: usize = 60 << 10;
 /// Queued messages at which a sender writes them itself, however short they are.
 const HELP_AT: usize = 128;
 /// Same as [`HELP_AT`], for longer messages. The drain task writes these better while it keeps up, because
@@ -65,7 +66,7 @@ impl<S: Socket> WriterState<S> {
                 Some(Poll::Ready(Err(error))) => self.connection.fail(error),
                 Some(Poll::Ready(Ok(()))) => bytes += self.gather_next(deferred),
             }
-            if bytes >= BYTES_PER_WAKE {
+            if bytes >= BYTES_PER_WAKE || self.connection.is_gathered_full() {
                 break;
             }
         }
@@ -82,7 +83,7 @@ impl<S: Socket> WriterState<S> {
         self.checked_at = None;
         let mut bytes = 0;
         for _ in 0..HELP_AT {
-            if bytes >= BYTES_PER_WAKE || !self.has_frame() {
+            if bytes >= BYTES_PER_WAKE || self.connection.is_gathered_full() || !self.has_frame() {
                 break;
             }
             bytes += self.gather_next(deferred);
@@ -131,8 +132,14 @@ impl<S: Socket> WriterState<S> {
     /// Gathers the next frame. If there is none, or no room for it, writes the gathered bytes and then the
     /// next piece of the frame. Returns how many bytes the socket has accepted.
     fn gather_next(&mut self, deferred: &mut DeferredActions) -> usize {
-        let Some(frame) = self.next_frame(deferred) else { return self.connection.write_gathered() };
-        let Err(frame) = self.gather(frame) else { return 0 };
+        let frame = if let Some(frame) = self.next_started() {
+            let Err(frame) = self.gather(frame) else { return 0 };
+            frame
+        } else {
+            let Some(message) = self.next_message(deferred) else { return self.connection.write_gathered() };
+            let Err(message) = self.gather_message(message) else { return 0 };
+            self.frame(message)
+        };
         let taken = self.connection.write_gathered();
         if self.connection.gathered() > 0 {
             self.connection.partial = Some(frame);
@@ -143,6 +150,19 @@ impl<S: Socket> WriterState<S> {
             Ok(()) => taken,
             Err(frame) => taken + self.write_frame(frame),
         }
+    }
+
+    /// Gathers the frame of a message that was never sent, if there is room. In a burst this is nearly every message:
+    /// it is encoded where it is gathered, and the session keeps the message itself.
+    fn gather_message(&mut self, mut message: Message) -> Result<(), Message> {
+        if message.size() > self.connection.gather_room() {
+            return Err(message);
+        }
+        self.counters.numbered += u64::from(self.numbering.assign(&mut message.header));
+        self.connection.gather_message(&message);
+        self.sent_message(&mut message);
+        self.numbering.keep(message);
+        Ok(())
     }
 
     /// Gathers a frame that has not been started, if there is room.
@@ -172,8 +192,17 @@ impl<S: Socket> WriterState<S> {
     }
 
     fn next_frame(&mut self, deferred: &mut DeferredActions) -> Option<Partial> {
-        if let Some(partial) = self.connection.partial.take() {
-            return Some(partial);
+        self.next_started().or_else(|| {
+            let message = self.next_message(deferred)?;
+            Some(self.frame(message))
+        })
+    }
+
+    /// Returns the next frame that precedes all messages that were never sent, or the last one behind them.
+    fn next_started(&mut self) -> Option<Partial> {
+        // Nearly always there is none, which is cheaper to see than to take.
+        if self.connection.partial.is_some() {
+            return self.connection.partial.take();
         }
         if let Some(urgent) = self.link_frames.pop_urgent() {
             return Some(self.link_frame(urgent));
@@ -185,11 +214,18 @@ impl<S: Socket> WriterState<S> {
             let last = if self.is_last_due() { self.link_frames.take_last() } else { None };
             return last.map(|last| self.link_frame(last));
         }
-        if !self.numbering.has_room() {
+        None
+    }
+
+    /// Returns the next message that was never sent.
+    fn next_message(&mut self, deferred: &mut DeferredActions) -> Option<Message> {
+        if self.unsent.is_empty() || !self.numbering.has_room() {
             return None;
         }
         let message = self.unsent.pop()?;
-        deferred.room.extend(self.unsent.queue.room_made());
+        if self.unsent.is_awaited() {
+            deferred.room.extend(self.unsent.room_made());
+        }
         // One look at the clock serves all frames of a turn. The receiver checks the time to live again.
         if message.header.time_to_live_us != 0
             && message.header.is_expired(*self.checked_at.get_or_insert_with(Time::now))
@@ -198,23 +234,17 @@ impl<S: Socket> WriterState<S> {
             self.expired(message, deferred);
             return None;
         }
-        Some(if message.header.kind == Kind::OUTCOME {
-            self.outcome_frame(message)
-        } else {
-            self.frame(message)
-        })
+        Some(if message.header.kind == Kind::OUTCOME { self.with_outcomes_behind(message) } else { message })
     }
 
-    /// Encodes an outcome, and those behind it, as a frame.
-    fn outcome_frame(&mut self, first: Message) -> Partial {
+    /// Combines an outcome with those behind it.
+    fn with_outcomes_behind(&mut self, first: Message) -> Message {
         if outcomes::count(&first) > 1 && self.connection.gathers() {
             // An outcome that is added to another is no part of the burst, which saves a look at the clock.
             self.bursts.written(Time::now());
         }
         let link = self.numbering.outcomes_header();
-        let message =
-            with_outcomes_behind(first, link, self.payload_max, &mut self.unsent.queue, &mut self.counters);
-        self.frame(message)
+        with_outcomes_behind(first, link, self.payload_max, &mut self.unsent.queue, &mut self.counters)
     }
 
     /// Writes the next piece of the started frame.

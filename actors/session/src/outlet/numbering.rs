@@ -113,6 +113,24 @@ impl Numbering {
         self.0.is_some()
     }
 
+    /// Sets the number of a message that is [kept](Self::keep) next. Returns whether there is a session.
+    #[inline]
+    pub(super) fn assign(&self, header: &mut Header) -> bool {
+        if let Some(session) = &self.0 {
+            header.number = session.sending.next_number() as u16;
+        }
+        self.0.is_some()
+    }
+
+    /// Keeps a message with an [assigned](Self::assign) number itself, not a copy.
+    #[inline]
+    pub(super) fn keep(&mut self, message: Message) {
+        if let Some(session) = &mut self.0 {
+            let size = message.size();
+            session.sending.keep(message, size);
+        }
+    }
+
     /// Removes the last number, because no byte of its message was written. Returns whether there is a
     /// session.
     pub(super) fn take_back(&mut self) -> bool {

@@ -16,6 +16,7 @@ use std::{
 };
 
 use sinew_runtime::{
+    WakerList,
     outcome::{Outcome, Receipt, Ticket},
     tid::Tid,
     time::Time,
@@ -163,19 +164,23 @@ impl Open {
 
     /// Registers a sender that found too many pending outcomes of this destination. It is woken when there
     /// are [fewer](Self::wake_if_fewer_open). Returns whether there still are too many.
-    pub(super) fn await_fewer(&self, destination: Tid, room: Option<&Waker>) -> bool {
+    pub(super) fn await_fewer(&self, destination: Tid, room: &Waker, deferred: &mut DeferredActions) -> bool {
         self.with(|all| {
             let is_at_bound = all.is_at_bound(destination);
             if is_at_bound {
-                all.awaited = room.map(|room| (destination, room.clone()));
+                if all.awaited.len() >= WakerList::MAX && !all.awaited.contains_key(&destination) {
+                    // Most of these wait no more; the others offer their messages again.
+                    deferred.room.extend(all.take_awaited());
+                }
+                deferred.room.extend(all.awaited.entry(destination).or_default().add(room));
             }
             is_at_bound
         })
     }
 
-    /// Takes the waker of the sender that waited for fewer pending outcomes; the caller must wake it.
-    pub(super) fn awaited_no_more(&self) -> Option<Waker> {
-        self.with(|all| all.awaited.take().map(|(_, waker)| waker))
+    /// Takes the wakers of the senders that waited for fewer pending outcomes; the caller must wake them.
+    pub(super) fn awaited_no_more(&self) -> Vec<Waker> {
+        self.with(Outstanding::take_awaited)
     }
 
     /// Returns the number of all messages, queued or sent.
@@ -203,13 +208,20 @@ struct Outstanding {
     waiting: usize,
     /// The message that is being written, and its outcome if that arrived before the write returned.
     writing: Option<(Ticket, Option<Outcome>)>,
-    /// The sender that waits for fewer pending outcomes, and its destination.
-    awaited: Option<(Tid, Waker)>,
+    /// The senders that wait for fewer pending outcomes, by their destination.
+    awaited: BTreeMap<Tid, WakerList>,
 }
 
 impl Outstanding {
     const fn new(shares: Shares) -> Self {
-        Self { shares, destinations: BTreeMap::new(), sent: 0, waiting: 0, writing: None, awaited: None }
+        Self {
+            shares,
+            destinations: BTreeMap::new(),
+            sent: 0,
+            waiting: 0,
+            writing: None,
+            awaited: BTreeMap::new(),
+        }
     }
 
     /// Counts a queued message of this destination with a pending outcome. Does nothing for `None`.
@@ -340,13 +352,25 @@ impl Outstanding {
         self.wake_if_fewer_open(deferred);
     }
 
-    /// Wakes the waiting sender once its destination has room for half of its share. Other destinations may
+    fn take_awaited(&mut self) -> Vec<Waker> {
+        std::mem::take(&mut self.awaited).into_values().flat_map(|mut waiting| waiting.take()).collect()
+    }
+
+    /// Wakes the waiting senders of each destination that has room for half of its share. Other destinations may
     /// stay at their bound forever.
     fn wake_if_fewer_open(&mut self, deferred: &mut DeferredActions) {
-        let Some((destination, _)) = &self.awaited else { return };
-        if self.room_for_all() > 0 && 2 * self.room_for(*destination) >= self.share_of_one() {
-            deferred.room.extend(self.awaited.take().map(|(_, waker)| waker));
+        if self.awaited.is_empty() || self.room_for_all() == 0 {
+            return;
         }
+        let mut awaited = std::mem::take(&mut self.awaited);
+        awaited.retain(|destination, waiting| {
+            let stays = 2 * self.room_for(*destination) < self.share_of_one();
+            if !stays {
+                deferred.room.extend(waiting.take());
+            }
+            stays
+        });
+        self.awaited = awaited;
     }
 
     /// Whether the destination or all destinations together are at their bound. With a session, each

@@ -109,15 +109,16 @@ impl SendQueue {
         self.queue.drain_all()
     }
 
-    pub(super) fn offered(&mut self, message: &Message, room: &Waker) -> Option<Waker> {
+    pub(super) fn offered(&mut self, message: &Message, room: &Waker) -> Vec<Waker> {
         self.queue.offered(message, room)
     }
 
-    pub(super) fn room_made(&mut self) -> Option<Waker> {
+    #[inline]
+    pub(super) fn room_made(&mut self) -> Vec<Waker> {
         self.queue.room_made()
     }
 
-    pub(super) fn awaited_no_more(&mut self) -> Option<Waker> {
+    pub(super) fn awaited_no_more(&mut self) -> Vec<Waker> {
         self.queue.awaited_no_more()
     }
 }

@@ -44,6 +44,11 @@ pub trait Socket: Send + 'static {
         false
     }
 
+    /// Bytes of frames that the buffer has room for.
+    fn gather_room(&self) -> usize {
+        0
+    }
+
     /// Copies a whole frame behind the frames gathered before. Returns whether the buffer had room.
     fn gather(&mut self, parts: &[IoSlice<'_>]) -> bool {
         let _ = parts;

@@ -6,9 +6,10 @@
 //! each move a whole queue there. To prevent that, the queue accepts less the more the backlog exceeds its
 //! bounds. spec: CREDIT-4
 
-use std::sync::Arc;
+use std::{sync::Arc, task::Waker};
 
 use sinew_runtime::{
+    WakerList,
     mailbox::{Bounds, Budget, ClassQueue},
     outcome::{Rejection, Ticket},
     router::SubmitError,
@@ -72,6 +73,14 @@ pub const fn destination_of(key: u64) -> AppAddress {
     AppAddress::new(key as u32)
 }
 
+/// The senders of messages that find no room because of the backlog.
+#[derive(Default)]
+struct BacklogWaits {
+    wakers: WakerList,
+    /// The number of messages in the queue when the last one was registered.
+    queued: usize,
+}
+
 /// The messages of an outlet that have not been sent yet.
 pub(super) struct Unsent {
     limits: OutletLimits,
@@ -83,6 +92,7 @@ pub(super) struct Unsent {
     backlog: Option<SendBacklog<u64, Message>>,
     /// A lower bound of the messages' expiry.
     next_expiry: Time,
+    backlog_waits: BacklogWaits,
 }
 
 impl Unsent {
@@ -98,7 +108,14 @@ impl Unsent {
             let queue_messages = messages.div_ceil(4);
             SendBacklog::new(BacklogLimits { queue_messages, messages, ..BACKLOG_LIMITS })
         });
-        Self { limits, queue: SendQueue::new(queue), interrupted: None, backlog, next_expiry: Time::MAX }
+        Self {
+            limits,
+            queue: SendQueue::new(queue),
+            interrupted: None,
+            backlog,
+            next_expiry: Time::MAX,
+            backlog_waits: BacklogWaits::default(),
+        }
     }
 
     /// Whether there is nothing to send now.
@@ -150,6 +167,48 @@ impl Unsent {
         };
         self.next_expiry = self.next_expiry.min(expiry);
         Ok(supersedes)
+    }
+
+    /// Registers a sender that keeps this message, which found no room. [`room_made`](Self::room_made) then returns
+    /// its waker. Returns the wakers to be woken now.
+    pub(super) fn offered(&mut self, message: &Message, room: &Waker) -> Vec<Waker> {
+        if self.held_key(&message.header).is_none() && self.has_room_beside_backlog(message) {
+            return self.queue.offered(message, room);
+        }
+        // The queue may have room: its own waits would end at once, again and again.
+        self.backlog_waits.queued = self.queue.len();
+        self.backlog_waits.wakers.add(room).into_iter().collect()
+    }
+
+    /// Whether a sender waits for room.
+    #[inline]
+    pub(super) fn is_awaited(&self) -> bool {
+        self.queue.is_awaited() || !self.backlog_waits.wakers.is_empty()
+    }
+
+    /// Returns the wakers of senders that may find room now that a message has left the queue. Call it after each
+    /// one, if a sender waits.
+    pub(super) fn room_made(&mut self) -> Vec<Waker> {
+        let mut woken = self.queue.room_made();
+        if !self.backlog_waits.wakers.is_empty() && self.queue.len() <= self.backlog_waits.queued / 2 {
+            woken.extend(self.backlog_waits.wakers.take());
+        }
+        woken
+    }
+
+    /// Same as [`room_made`](Self::room_made), after messages were removed from the backlog or held destinations have
+    /// changed.
+    pub(super) fn backlog_changed(&mut self) -> Vec<Waker> {
+        let mut woken = self.queue.room_made();
+        woken.extend(self.backlog_waits.wakers.take());
+        woken
+    }
+
+    /// Returns the wakers of all senders that wait for room: they must be notified of another change.
+    pub(super) fn awaited_no_more(&mut self) -> Vec<Waker> {
+        let mut woken = self.queue.awaited_no_more();
+        woken.extend(self.backlog_waits.wakers.take());
+        woken
     }
 
     /// Returns the next message to send.
@@ -208,8 +267,15 @@ impl Unsent {
     }
 
     /// Applies the peer's announcement of held destinations. Messages move between the queue and the backlog,
-    /// and keep their order.
-    pub(super) fn on_held(&mut self, ack: &Ack) {
+    /// and keep their order. Returns the wakers of senders that may find room now.
+    pub(super) fn on_held(&mut self, ack: &Ack) -> Vec<Waker> {
+        let former = self.backlog.as_ref().and_then(SendBacklog::change);
+        self.apply_held(ack);
+        let is_new = self.backlog.as_ref().and_then(SendBacklog::change) != former;
+        if is_new { self.backlog_changed() } else { Vec::new() }
+    }
+
+    fn apply_held(&mut self, ack: &Ack) {
         let Some(backlog) = &mut self.backlog else { return };
         let HeldChange { holds_more, released } = backlog.on_held(ack.change, ack.held.iter().copied());
         for message in released.into_iter().rev() {

@@ -239,10 +239,11 @@ impl<S: Socket> WriterState<S> {
         deferred: &mut DeferredActions,
     ) {
         self.counters.counts.refused -= 1;
+        let Some(room) = room else { return };
         if !confirming_destination(message)
-            .is_some_and(|destination| self.receipts.await_fewer(destination, room))
+            .is_some_and(|destination| self.receipts.await_fewer(destination, room, deferred))
         {
-            deferred.room.extend(room.and_then(|room| self.unsent.queue.offered(message, room)));
+            deferred.room.extend(self.unsent.offered(message, room));
         }
     }
 
@@ -318,11 +319,17 @@ impl<S: Socket> WriterState<S> {
     /// Processes a frame that was written whole: takes its receipt.
     pub(super) fn sent(&mut self, frame: &mut Partial) {
         if frame.origin == FrameOrigin::Sender {
-            self.counters.counts.sent += messages_in(&frame.message);
-            self.connection.note_sent(&frame.message.header);
+            self.sent_message(&mut frame.message);
         }
-        let expiry = frame.message.header.expiry();
-        if let Some(receipt) = frame.message.receipt.take() {
+    }
+
+    /// Same as [`sent`](Self::sent), for a sender's message that was written for the first time.
+    #[inline]
+    pub(super) fn sent_message(&mut self, message: &mut Message) {
+        self.counters.counts.sent += messages_in(message);
+        self.connection.note_sent(&message.header);
+        let expiry = message.header.expiry();
+        if let Some(receipt) = message.receipt.take() {
             let written = self.connection.written();
             self.early_outcomes.extend(self.receipts.sent(SentMessage { receipt, expiry, written }));
         }
@@ -353,7 +360,7 @@ impl<S: Socket> WriterState<S> {
         }
         let had_frame = self.has_frame();
         let Some(effect) = self.numbering.on_ack(ack) else { return false };
-        self.unsent.on_held(ack);
+        deferred.room.extend(self.unsent.on_held(ack));
         // A frame that could be written before has its wake. In a flood another one for each ACK would end its delay.
         if !had_frame && self.has_frame() || !matches!(effect, AckEffect::Known) {
             self.connection.wake_drainer(deferred);
@@ -421,7 +428,7 @@ impl<S: Socket> WriterState<S> {
     /// whether it was queued here.
     pub(super) fn cancel(&mut self, ticket: Ticket, deferred: &mut DeferredActions) -> bool {
         let Some(message) = self.unsent.take_request(ticket) else { return false };
-        deferred.room.extend(self.unsent.queue.room_made());
+        deferred.room.extend(self.unsent.backlog_changed());
         self.receipts.remove_waiting(confirming_destination(&message));
         self.expired(message, deferred);
         true
@@ -429,7 +436,11 @@ impl<S: Socket> WriterState<S> {
 
     /// Returns whether any message is left that can expire, or any outcome that can become overdue.
     pub(super) fn expire(&mut self, now: Time, deferred: &mut DeferredActions) -> bool {
-        for message in self.unsent.take_expired(now) {
+        let expired = self.unsent.take_expired(now);
+        if !expired.is_empty() {
+            deferred.room.extend(self.unsent.backlog_changed());
+        }
+        for message in expired {
             self.receipts.remove_waiting(confirming_destination(&message));
             self.expired(message, deferred);
         }

@@ -10,6 +10,7 @@ mod orphans;
 mod outcomes;
 mod panics;
 mod protection;
+mod room;
 mod turns;
 
 use std::{

@@ -237,3 +237,65 @@ fn acknowledgement_wakes_the_drainer_only_for_a_message() {
     bench.drain();
     assert_eq!(bench.seen(), [1, 2, 3]);
 }
+
+// spec: SESSION-1, SESSION-3
+#[test]
+fn gathered_messages_of_a_session_are_numbered_and_sent_again() {
+    let window = Window { messages: 64, bytes: PLENTY };
+    let void = Header::new(Kind::GNCL_VOID, tid(0), tid(1));
+    let limits = OutletLimits { queue_capacity: 200, ..LIMITS };
+    let outlet = SocketWriter::with_session(limits, Session::new(1, window, void, None));
+    // Connects to a peer that expects this number, and returns the wire.
+    let connect = |next| {
+        let wire = Arc::new(Wire::default());
+        wire.room.store(PLENTY, Ordering::Relaxed);
+        let link = outlet.connect(Gathering::new(wire.clone(), Checksum::Crc), usize::MAX, None);
+        let ack = Ack { receiver_id: 1, epoch: 1, peer_epoch: 1, next, change: 0, held: vec![], room: None };
+        outlet.on_ack(link, &ack, Time::now());
+        (wire, link)
+    };
+    let drain = |link| assert!((0..16).find_map(|_| outlet.drain(link).now_or_never()).is_none());
+    let seen = |wire: &Wire| {
+        let frames = frames(&wire.bytes.lock().unwrap());
+        frames.iter().map(|message| (message.header.number, message.payload[0])).collect::<Vec<_>>()
+    };
+    let expected =
+        |values: std::ops::Range<u8>| values.map(|value| (u16::from(value) + 1, value)).collect::<Vec<_>>();
+    // Given: a burst, of which some messages are written one by one and the others together
+    let (wire, link) = connect(1);
+    for value in 0..40 {
+        let mut message = message(Class::Bulk, value);
+        message.header.sent = Time::from_nanos(1_000_000);
+        outlet.submit(message).unwrap();
+    }
+    drain(link);
+    assert_eq!(seen(&wire), expected(0..40));
+    // When: ten have arrived, and the connection ends
+    outlet.disconnect(link);
+    let (wire, link) = connect(11);
+    drain(link);
+    // Then
+    assert_eq!(seen(&wire), expected(10..40));
+    assert_eq!(outlet.counts().sent, 40);
+}
+
+#[test]
+fn full_buffer_is_written_without_a_single_frame_behind_it() {
+    // Given: many messages of a burst, of which one more than the buffer has room for would be written alone
+    let limits = OutletLimits { queue_capacity: 200, queue_bytes: 1 << 20, ..LIMITS };
+    let (outlet, wire, writes) = (SocketWriter::new(limits), Arc::new(Wire::default()), Arc::default());
+    let socket = Counting { wire: Arc::clone(&wire), writes: Arc::clone(&writes) };
+    let link = outlet.connect(Gathering::new(socket, Checksum::Crc), usize::MAX, None);
+    for value in 0..180 {
+        let header = Header { sent: Time::from_nanos(1_000_000), ..message(Class::Bulk, value).header };
+        outlet.submit(Message::new(header, vec![value; 1_000].into())).unwrap();
+    }
+    // When: the wire accepts everything
+    wire.room.store(PLENTY, Ordering::Relaxed);
+    let before = writes.load(Ordering::Relaxed);
+    assert!((0..16).find_map(|_| outlet.drain(link).now_or_never()).is_none());
+    // Then: 180 frames of 1064 bytes are four writes
+    let frames = frames(&wire.bytes.lock().unwrap());
+    assert_eq!(frames.len(), 180);
+    assert_eq!(writes.load(Ordering::Relaxed) - before, 4);
+}

@@ -104,3 +104,63 @@ fn interrupted_value_replaces_no_waiting_one() {
     bench.reconnect(PLENTY);
     assert_eq!(bench.outlet.counts(), OutletCounts { sent: 1, superseded: 1, ..OutletCounts::default() });
 }
+
+#[test]
+fn all_senders_are_woken_together() {
+    let (bench, senders) = (Bench::new(PLENTY), [waker(), waker()]);
+    let times = || senders.iter().map(|(woken, _)| woken.0.load(Ordering::Relaxed)).collect::<Vec<_>>();
+    // Both bounds: that of messages without an outcome, and that of the queue.
+    (1..=4).for_each(|correlation| bench.submit(bench.confirmed(correlation)));
+    for (_, waker) in &senders {
+        drop(bench.outlet.offer(bench.confirmed(5), Some(waker)).unwrap_err());
+    }
+    for correlation in 1..=4 {
+        bench.outlet.confirm(Ticket { source: tid(0), destination: tid(1), correlation }, Outcome::Delivered);
+    }
+    assert_eq!(times(), [1; 2]);
+    bench.wire.room.store(0, Ordering::Relaxed);
+    (0..4).for_each(|value| bench.submit(message(Class::Bulk, value)));
+    for (_, waker) in &senders {
+        bench.outlet.offer(message(Class::Bulk, 4), Some(waker)).unwrap_err();
+    }
+    bench.make_room(PLENTY);
+    assert_eq!(times(), [2; 2]);
+}
+
+#[test]
+fn sender_is_woken_when_queued_messages_expire() {
+    let (bench, (woken, waker)) = (Bench::new(0), waker());
+    (0..4).for_each(|value| bench.submit(expiring(Class::Bulk, value)));
+    bench.outlet.offer(message(Class::Bulk, 4), Some(&waker)).unwrap_err();
+    bench.outlet.expire(Time::now() + Duration::from_secs(61));
+    assert_eq!(woken.0.load(Ordering::Relaxed), 1);
+}
+
+/// Receives the peer's announcement, of this number, that these destinations are held.
+fn hold(bench: &Bench, change: u64, held: Vec<u64>) {
+    let ack = Ack { receiver_id: 1, epoch: 1, peer_epoch: 1, next: 1, change, held, room: None };
+    bench.outlet.on_ack(bench.link, &ack, Time::now());
+}
+
+// spec: CREDIT-3
+#[test]
+fn sender_for_a_held_destination_waits_for_its_release() {
+    // Given: a held destination with as many messages as may wait for it. The queue itself is empty.
+    let (bench, (woken, waker)) = (session(PLENTY), waker());
+    let key = backlog_key(&message(Class::Bulk, 0).header).expect("it is for a mailbox");
+    hold(&bench, 2, vec![key]);
+    let taken = (0..=u8::MAX).take_while(|value| bench.outlet.submit(message(Class::Bulk, *value)).is_ok());
+    assert_eq!(taken.count(), bench.outlet.in_backlog());
+    // When, then: the sender waits, also after an announcement without a change.
+    let refused = bench.outlet.offer(message(Class::Bulk, 0), Some(&waker)).unwrap_err();
+    hold(&bench, 2, vec![key]);
+    assert_eq!((refused.why, woken.0.load(Ordering::Relaxed)), (Rejection::QueueFull, 0));
+    hold(&bench, 3, Vec::new());
+    assert_eq!(woken.0.load(Ordering::Relaxed), 1);
+    // And: the released messages fill the queue until they are written.
+    let refused = bench.outlet.offer(refused.message, Some(&waker)).unwrap_err();
+    assert_eq!((refused.why, woken.0.load(Ordering::Relaxed)), (Rejection::QueueFull, 1));
+    bench.drain();
+    assert_eq!(woken.0.load(Ordering::Relaxed), 2);
+    bench.outlet.offer(refused.message, Some(&waker)).expect("it has room");
+}
