@@ -19,7 +19,7 @@ use std::{
     collections::BTreeMap,
     sync::{
         Arc, Mutex, OnceLock,
-        atomic::{AtomicU64, Ordering},
+        atomic::{AtomicBool, AtomicU64, Ordering},
     },
     task::Waker,
 };
@@ -122,6 +122,8 @@ pub struct Router {
     stop: Arc<StopLatch>,
     /// The applications of which echoes are handed over after a stop.
     echo_sources: ArcSwap<stop::EchoSources>,
+    /// Whether outputs in this process are measured by a dry run when they are made.
+    runs_dry: AtomicBool,
     /// The clock of the applications that send with this table.
     clock: Clock,
 }
@@ -141,6 +143,7 @@ impl Router {
             retained: Mutex::default(),
             stop: Arc::default(),
             echo_sources: ArcSwap::default(),
+            runs_dry: AtomicBool::new(false),
             clock: Clock::WALL,
         }
     }
