@@ -24,6 +24,7 @@
 //! | identities and keys | [`security`] |
 //! | protected commands and safe outputs | [`protection`] |
 //! | the stop of the whole system | [`stop`] |
+//! | to which state an application goes when another part is lost, late or stopped | [`contracts`] |
 //! | counts of every message | [`audit`] |
 //! | reports for tools | [`inspect`] |
 //! | the structure of payload types | [`schema`] |
@@ -116,9 +117,23 @@ pub mod barrier {
 pub mod config {
     #[doc(inline)]
     pub use sinew_model::config::{
-        AppSettings, ConfigError, ConfigFault, Families, GnclConfig, Interface, InterfaceError, Interfaces,
-        LnclConfig, LogConfig, LogLevel, NdlConfig, NodeConfig, RecordCompression, RecordConfig, RtConfig,
-        SecurityConfig, Seed, SeedError, StopConfig, SupervisionConfig, SyncConfig, TimePolicy, WatchGroup,
+        AppSettings, ConfigError, ConfigFault, ContractsConfig, Families, GnclConfig, Interface,
+        InterfaceError, Interfaces, LnclConfig, LogConfig, LogLevel, NdlConfig, NodeConfig,
+        RecordCompression, RecordConfig, RtConfig, SecurityConfig, Seed, SeedError, StopConfig,
+        SupervisionConfig, SyncConfig, TimePolicy, WatchGroup,
+    };
+}
+
+/// Contracts: to which state an application goes when another part of the system is lost, late or stopped, and within
+/// which time. An application declares them by [`AppSpec::contract`](crate::AppSpec::contract). `sinew contracts` shows
+/// and checks those of the whole system.
+pub mod contracts {
+    pub use sinew_model::contracts::{
+        AskContracts, CONTRACTS_LISTED_MAX, Closure, CommandedOutput, ContractReport, ContractRow,
+        ContractsReport, Gap,
+    };
+    pub use sinew_runtime::app::{
+        CONTRACT_TIME_MAX, CONTRACTS_MAX, Condition, Contract, ContractConditions, Subject,
     };
 }
 

@@ -185,6 +185,20 @@ pub(crate) enum Command {
   sinew audit
   sinew audit --wide            a column for each counter"#)]
     Audit,
+    /// Checks the contracts of all applications: to which state each goes when another part is lost, late or stopped
+    ///
+    /// Each guarded output needs a contract for its sender being lost, late and stopped. The worst time of each
+    /// contract is computed from the settings, and compared with its declared time. A contract that does not close is
+    /// named with the sum and the setting to change. With `contracts.dry_run` on a node its outputs are measured,
+    /// too.
+    ///
+    /// Exit code 0: all close. 1: a contract is missing, does not close, or a node does not answer completely. 3: no
+    /// node accepts the command.
+    #[command(after_help = r#"Examples:
+  sinew contracts
+  sinew contracts --wide
+  sinew contracts --json | jq '.contracts[] | select(.closes | not) | .fault'"#)]
+    Contracts,
     /// Shows and sets the parameters of applications while they run
     ///
     /// A set of values is checked as a whole by its application, and applied at a tick of its loop: the command prints

@@ -14,6 +14,7 @@ mod apps;
 mod arguments;
 mod audit;
 mod bag;
+mod contracts;
 mod doctor;
 mod keys;
 mod logs;
@@ -142,6 +143,7 @@ fn run(arguments: &Arguments) -> Result<Report, SystemError> {
         Command::Schema { name } => inside(&|system| schema::show(system, name)),
         Command::Barriers => inside(&|system| apps::barriers(system, arguments.wide)),
         Command::Audit => inside(&|system| audit::show(system, arguments.wide)),
+        Command::Contracts => inside(&|system| contracts::show(system, arguments.wide)),
         Command::Param(order) => inside(&|system| param::show(system, order, arguments.wide)),
         Command::Reload => inside(&reload::show),
         Command::Stop(order) => inside(&|system| stop::show(system, order, arguments.wide)),

@@ -20,7 +20,7 @@ use std::{
     collections::BTreeMap,
     sync::{
         Arc, Mutex, OnceLock,
-        atomic::{AtomicU64, AtomicUsize, Ordering},
+        atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering},
     },
     task::Waker,
 };
@@ -126,6 +126,8 @@ pub struct Router {
     echo_sources: ArcSwap<stop::EchoSources>,
     /// The number of messages that wait for room in a queue.
     room_waits: AtomicUsize,
+    /// Whether outputs in this process are measured by a dry run when they are made.
+    runs_dry: AtomicBool,
     /// The clock of the applications that send with this table.
     clock: Clock,
 }
@@ -146,6 +148,7 @@ impl Router {
             stop: Arc::default(),
             echo_sources: ArcSwap::default(),
             room_waits: AtomicUsize::new(0),
+            runs_dry: AtomicBool::new(false),
             clock: Clock::WALL,
         }
     }

@@ -4,6 +4,7 @@
 pub mod attacks;
 pub mod barriers;
 pub mod clients;
+pub mod contracts;
 pub mod link_faults;
 pub mod load;
 pub mod orders;

@@ -3,6 +3,7 @@
 mod away;
 mod black_channel;
 mod clients;
+mod contracts;
 mod faults;
 mod nodes;
 mod processes;

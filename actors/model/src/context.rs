@@ -96,13 +96,17 @@ impl NodeContext {
     #[must_use]
     pub fn new(config: NodeConfig, incarnation: Incarnation, root: Arc<dyn Root>) -> Arc<Self> {
         let (node, checks) = (config.node_address(), Arc::<PeriodicChecks>::default());
+        let router = Router::new(node);
+        if config.contracts.dry_run {
+            router.run_dry();
+        }
         Arc::new(Self {
             node,
             incarnation,
             has_started: AtomicBool::new(false),
             stopping: AtomicBool::new(false),
             gave_up: OnceLock::new(),
-            router: Arc::new(Router::new(node)),
+            router: Arc::new(router),
             event_queues: EventQueues::default(),
             root,
             ports: Ports::default(),

@@ -5,6 +5,7 @@
 //! | [`context`] | the state that all layers of one node share |
 //! | [`ports`] | the traits by which layers call each other |
 //! | [`config`] | the configuration of a node |
+//! | [`contracts`] | the contracts of a whole system, and the check that they close |
 //! | [`clocks`] | the clock offsets of other nodes |
 //! | [`directory`] | the directory of names, and the applications that wait for names |
 //! | [`events`], [`event_backlog`], [`app_backlog`] | the event queues of the layers, and the backlogs of events for full ones |
@@ -36,6 +37,7 @@ pub mod cause;
 pub mod clocks;
 pub mod config;
 pub mod context;
+pub mod contracts;
 pub mod directory;
 pub mod event_backlog;
 pub mod events;

@@ -179,6 +179,7 @@ impl Apps {
             table.by_address.remove(&app.tid.app);
             app.mailbox.close();
             state.lncl.book.remove_mailbox(app.tid.app);
+            state.contracts.remove(app.tid.app);
             sinew_lncl::unregister_local(&state.lncl, app.tid.app);
         }
     }

@@ -10,6 +10,7 @@ use sinew_runtime::{
 };
 use sinew_security::SecurityState;
 
+use super::inspect::Contracts;
 use super::log_ring::LogRing;
 use super::real_time::RealTime;
 use super::recording::{Recording, Triggers};
@@ -43,6 +44,8 @@ pub(crate) struct NodeState {
     pub(crate) recording: Recording,
     /// The proof of real time.
     pub(crate) real_time: Arc<RealTime>,
+    /// The contracts of its applications.
+    pub(crate) contracts: Contracts,
     /// The newest lines of the log.
     pub(crate) log: Arc<LogRing>,
 }
@@ -69,6 +72,7 @@ impl NodeState {
             types: Types::default(),
             recording: Recording::default(),
             real_time: Arc::default(),
+            contracts: Contracts::default(),
             log: LogRing::begin(),
         });
         state.connect();

@@ -2,6 +2,7 @@
 
 mod access;
 mod bag;
+mod contracts;
 mod doctor;
 mod fault;
 mod keys;

@@ -8,7 +8,7 @@ use std::{
 use crate::scenario::{Answer, Scenario};
 
 /// One invocation of each command that ends by itself, for a node called `hip`.
-const COMMANDS: [&[&str]; 18] = [
+const COMMANDS: [&[&str]; 19] = [
     &["--help"],
     &["--version"],
     &["watch", "--help"],
@@ -26,6 +26,7 @@ const COMMANDS: [&[&str]; 18] = [
     &["schema", "demo.nothing"],
     &["barriers"],
     &["audit"],
+    &["contracts"],
     &["doctor"],
 ];
 

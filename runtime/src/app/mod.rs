@@ -5,6 +5,7 @@
 //! `run_later`, an `Addr`) work as usual.
 
 mod context;
+mod contract;
 mod delivery;
 mod down_policy;
 mod drive;
@@ -15,6 +16,7 @@ mod send_outcome;
 mod spec;
 
 pub use context::{AppContext, WatchId};
+pub use contract::{CONTRACT_TIME_MAX, CONTRACTS_MAX, Condition, Contract, ContractConditions, Subject};
 pub use delivery::{Delivery, Raw};
 pub use down_policy::{DownPolicy, DownState, LastWill, WILLS_MAX, Will, WillRecipient};
 pub use input_watch::{InputCriterion, InputTimeout};

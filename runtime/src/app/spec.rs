@@ -1,5 +1,6 @@
 //! The declaration of an application, which a node needs to start it.
 
+mod contracts;
 mod dyn_app;
 mod parameters;
 
@@ -10,7 +11,7 @@ use sinew_params::Parameters;
 
 use crate::{
     app::{
-        AppContext, Delivery, DownPolicy, Raw, RequirementEvent, RequirementPolicy, Will,
+        AppContext, Contract, Delivery, DownPolicy, Raw, RequirementEvent, RequirementPolicy, Will,
         context::KeptHook,
         drive::{Dispatch, Drive, dispatch_raw, dispatch_typed},
         requirement::{EndReason, FailedStart, Requirements, SafeState, WithEndReason},
@@ -75,6 +76,7 @@ pub(super) struct Common {
     /// The parameters; `None`: it has none.
     parameters: Option<Arc<dyn Parameters>>,
     on_kept: KeptHook,
+    contracts: Vec<Contract>,
     #[cfg(feature = "fault-points")]
     faults: Vec<crate::supervision::fault::Fault>,
 }
@@ -124,6 +126,7 @@ impl<A: Actor<Context = AppContext<A>>> AppSpec<A> {
             parameter_sets: 0,
             parameters: None,
             on_kept: KeptHook::default(),
+            contracts: Vec::new(),
             #[cfg(feature = "fault-points")]
             faults: Vec::new(),
         };

@@ -1,6 +1,7 @@
 //! A guarded output, which is safe unless good commands arrive.
 
 mod arming;
+mod dry_run;
 mod guarded;
 #[cfg(test)]
 mod stop_tests;
@@ -15,6 +16,7 @@ use std::{
     time::Duration,
 };
 
+use self::dry_run::DryRun;
 pub(crate) use self::guarded::Guarded;
 use super::{
     ArmError, Cause, DataId, State, Tally,
@@ -82,6 +84,8 @@ struct Inner<O> {
     output: O,
     safe: MakeSafe<O>,
     retry: Option<SafeRetry>,
+    /// The dry run that has not ended yet.
+    dry_run: Option<DryRun>,
     /// The log entry to write after the lock is released.
     log_entry: Option<LogEntry>,
 }
@@ -127,7 +131,8 @@ impl<O> Inner<O> {
     /// Returns when the thread `safe-output` must check the output.
     fn deadline(&self) -> u64 {
         let retry_at = self.retry.map(|retry| retry.at);
-        retry_at.or_else(|| self.receiver.deadline()).map_or(u64::MAX, Time::as_nanos)
+        let deadline = retry_at.or_else(|| self.receiver.deadline());
+        deadline.or_else(|| self.dry_run.map(DryRun::ends)).map_or(u64::MAX, Time::as_nanos)
     }
 }
 
@@ -192,8 +197,9 @@ impl<O: Send + 'static> Guard<O> {
         }
         let data_id = DataId { source, destination, name: protected.name };
         let receiver = Receiver::new(protected.protection);
+        let safe = Box::new(safe);
         let mut inner =
-            Inner { data_id, receiver, output, safe: Box::new(safe), retry: None, log_entry: None };
+            Inner { data_id, receiver, output, safe, retry: None, dry_run: None, log_entry: None };
         inner.make_safe(Cause::NotArmed, clock.now());
         inner.log_entry.take().into_iter().for_each(LogEntry::log);
         let deadline = inner.deadline();
@@ -478,6 +484,7 @@ impl<O: Send + 'static> WatchedOutput for Shared<O> {
             Err(TryLockError::WouldBlock) => return CheckResult::Locked,
         };
         self.retry_safe(&mut inner, self.clock.now());
+        self.end_dry_run(&mut inner);
         self.decide_locked(&mut inner, |receiver, now| receiver.expire(now));
         CheckResult::Done(inner.log_entry.take())
     }

@@ -12,7 +12,7 @@ use std::{
     time::Duration,
 };
 
-use super::{Cause, DataId, State, safe_output::WatchState, stop_latch::StopLatch};
+use super::{Cause, DataId, Protection, State, safe_output::WatchState, stop_latch::StopLatch};
 use crate::{lock, tid::NodeAddress};
 
 /// Maximum number of outputs in the list. Further ones work, and are in no report.
@@ -84,6 +84,10 @@ pub struct OutputState {
     pub state: State,
     /// Whether its safe function has failed and is retried: it may still be live.
     pub is_safe_failed: bool,
+    /// The limits of its commands.
+    pub protection: Protection,
+    /// Time from the last command until the output was safe, in a dry run; `None`: it had none.
+    pub measured: Option<Duration>,
 }
 
 /// The outputs that one stop concerns, for its report.
@@ -134,6 +138,11 @@ pub fn outputs() -> Vec<OutputState> {
         data_id,
         state: watch.published.get(),
         is_safe_failed: watch.needs_retry.load(Ordering::Acquire),
+        protection: watch.protection,
+        measured: match watch.measured_ns.load(Ordering::Relaxed) {
+            0 => None,
+            nanos => Some(Duration::from_nanos(nanos)),
+        },
     };
     living.filter(|(_, watch)| !is_over(watch)).map(state).collect()
 }
@@ -142,7 +151,7 @@ pub fn outputs() -> Vec<OutputState> {
 mod tests {
     use super::*;
     use crate::{
-        protection::{Guard, Protection},
+        protection::Guard,
         tid::{AppAddress, NodeAddress, Tid},
         wire::Payload,
     };
@@ -175,7 +184,11 @@ mod tests {
         let tid = |app| Tid::new(NodeAddress::new(7), AppAddress::new(app));
         let data_id = DataId::of::<Torque>(tid(1), tid(2));
         let guard = Guard::new::<Torque>(tid(1), tid(2), (), |(), _| {}).expect("there is the thread");
-        let listed = |cause| vec![OutputState { data_id, state: State::Safe(cause), is_safe_failed: false }];
+        let protection = Protection::of_period(Duration::from_millis(20));
+        let listed = |cause| {
+            let state = State::Safe(cause);
+            vec![OutputState { data_id, state, is_safe_failed: false, protection, measured: None }]
+        };
         assert_eq!(states(), listed(Cause::NotArmed));
         guard.trip();
         assert_eq!(guard.state(), states()[0].state, "the list agrees with the guard");

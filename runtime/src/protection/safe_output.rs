@@ -51,6 +51,8 @@ pub(super) struct WatchState {
     pub(super) needs_retry: AtomicBool,
     /// The state of the output, for reports.
     pub(super) published: PublishedState,
+    /// Time from the last command until the output was safe, in a dry run, in nanoseconds; 0: there was none.
+    pub(super) measured_ns: AtomicU64,
     /// The limits of the commands.
     pub(super) protection: Protection,
     /// The stop of the node.
@@ -76,6 +78,7 @@ impl WatchState {
             is_orphan: AtomicBool::new(false),
             needs_retry: AtomicBool::new(needs_retry),
             published: PublishedState::not_armed(),
+            measured_ns: AtomicU64::new(0),
             protection,
             stop,
             acknowledged: AtomicU64::new(acknowledged),

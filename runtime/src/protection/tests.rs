@@ -3,9 +3,11 @@
 //! | file | content |
 //! | --- | --- |
 //! | `black_channel` | each class of error, injected between the two |
+//! | `bound` | the time after the last command within which an output is safe |
 //! | `outside` | bytes from outside |
 
 mod black_channel;
+mod bound;
 mod outside;
 
 use std::{

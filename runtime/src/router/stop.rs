@@ -2,7 +2,7 @@
 
 use std::{
     collections::{BTreeMap, BTreeSet},
-    sync::Arc,
+    sync::{Arc, atomic::Ordering},
 };
 
 use super::Router;
@@ -29,6 +29,17 @@ impl Router {
     #[must_use]
     pub const fn stop(&self) -> &Arc<StopLatch> {
         &self.stop
+    }
+
+    /// Has each output that an application of this process makes from now on measured by a dry run: its safe function
+    /// is called once more, before the output is armed.
+    pub fn run_dry(&self) {
+        self.runs_dry.store(true, Ordering::Relaxed);
+    }
+
+    /// Returns whether outputs are measured by a dry run.
+    pub(crate) fn runs_dry(&self) -> bool {
+        self.runs_dry.load(Ordering::Relaxed)
     }
 
     /// Stops the outputs of this process at once, if the node is in this process.

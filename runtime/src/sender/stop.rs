@@ -20,6 +20,11 @@ impl Sender {
         self.shared.router.stop()
     }
 
+    /// Returns whether outputs of this application are measured by a dry run.
+    pub(crate) fn runs_dry(&self) -> bool {
+        self.shared.router.runs_dry()
+    }
+
     /// Adds this application to those with an output in this process.
     pub(crate) fn add_guarded_here(&self) {
         self.shared.router.add_guarded_here(self.shared.tid.app);

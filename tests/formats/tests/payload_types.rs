@@ -10,6 +10,7 @@ use exoskeleton::robot::edges::{Arm, BarrierStatus, EmergencyStop, GaitStatus, R
 use exoskeleton_model::message::{DriveStatus, DriveTick, FootLoad, GaitState, JointSample, TorqueSet};
 use sinew::{
     Payload,
+    contracts::{AskContracts, ContractsReport},
     events::{DirectoryEvent, Down, NodeEvent, RequirementEvent, Undelivered},
     inspect::{
         AccessReport, AppsReport, AskAccess, AskApps, AskAudit, AskFreeze, AskFrozen, AskGroups, AskLogs,
@@ -105,6 +106,7 @@ fn every_payload_type_of_this_tree_is_traced() {
         AskReach AskRecord AskReload AskSchemas AskTree AskWatch AuditReport FreezeReport FrozenReport LogsReport
         MismatchesReport NodeReport Ping ReachReport RecordReport ReloadReport SchemasReport TreeReport WatchReport
         ArriveAtBarrier BarrierAnswer LeaveBarrier
+        AskContracts ContractsReport
         AskParameters ParameterList ParameterOutcome SetParameters
         AcknowledgeStop AskStop PressStop ReleaseStop StopReport
     };

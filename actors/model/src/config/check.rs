@@ -83,6 +83,7 @@ pub(super) const KEEP: Range = range("record.keep_ms", 1_000, 600_000, "ms");
 pub(super) const AFTER: Range = range("record.after_ms", 1_000, 60_000, "ms");
 pub(super) const FROZEN_MAX: Range = range("record.frozen_max", 0, 64, "spans");
 pub(super) const PROBE: Range = range("rt.probe_ms", 0, 60_000, "ms");
+pub(super) const SLACK: Range = range("contracts.slack_ms", 0, 1_000, "ms");
 /// Maximum number of names in `record.apps` and `record.types`, and maximum bytes of one.
 const RECORDED_MAX: usize = 64;
 const RECORDED_BYTES_MAX: usize = 255;
@@ -152,6 +153,7 @@ impl NodeConfig {
         self.check_security(&mut faults);
         self.check_record(&mut faults);
         PROBE.time(&mut faults, self.rt.probe);
+        SLACK.time(&mut faults, self.contracts.slack);
         ConfigError::check(faults)
     }
 

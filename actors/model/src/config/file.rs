@@ -23,11 +23,24 @@ use super::{
 /// Longest configuration file in bytes.
 const FILE_BYTES_MAX: u64 = 1 << 20;
 
-const SECTIONS: [&str; 12] =
-    ["node", "lncl", "gncl", "ndl", "sync", "supervision", "security", "log", "record", "rt", "stop", "app"];
+const SECTIONS: [&str; 13] = [
+    "node",
+    "lncl",
+    "gncl",
+    "ndl",
+    "sync",
+    "supervision",
+    "security",
+    "log",
+    "record",
+    "rt",
+    "stop",
+    "contracts",
+    "app",
+];
 
 /// Every key of every section.
-pub(super) const KEYS: [&str; 64] = [
+pub(super) const KEYS: [&str; 66] = [
     "node.name",
     "node.project",
     "node.address",
@@ -92,6 +105,8 @@ pub(super) const KEYS: [&str; 64] = [
     "record.compression",
     "rt.probe_ms",
     "stop.on_lost",
+    "contracts.dry_run",
+    "contracts.slack_ms",
 ];
 
 impl NodeConfig {
@@ -141,6 +156,8 @@ impl NodeConfig {
         reader.read_record(&mut config);
         reader.time(&check::PROBE, &mut config.rt.probe);
         reader.truth("stop.on_lost", &mut config.stop.on_lost);
+        reader.truth("contracts.dry_run", &mut config.contracts.dry_run);
+        reader.time(&check::SLACK, &mut config.contracts.slack);
         config.app_settings = reader.app_settings.take().unwrap_or_default();
         let faults = reader.finish(&config).err().map(ConfigError::into_vec).unwrap_or_default();
         Ok((config, faults))

@@ -6,6 +6,7 @@
 
 mod app_settings;
 mod check;
+mod contracts;
 mod faults;
 mod file;
 mod interfaces;
@@ -39,6 +40,7 @@ use sinew_runtime::{
 
 pub use self::{
     app_settings::AppSettings,
+    contracts::ContractsConfig,
     log_level::LogLevel,
     real_time::RtConfig,
     record::{RecordCompression, RecordConfig},
@@ -103,6 +105,8 @@ pub struct NodeConfig {
     pub rt: RtConfig,
     /// The stop of the whole system.
     pub stop: StopConfig,
+    /// The contracts of applications.
+    pub contracts: ContractsConfig,
     /// The settings of applications: the tables `[app.NAME]` of its file, which [`NodeConfig::app`] reads.
     /// Default: none.
     pub app_settings: AppSettings,
@@ -430,6 +434,7 @@ impl NodeConfig {
             record: RecordConfig::default(),
             rt: RtConfig::default(),
             stop: StopConfig::default(),
+            contracts: ContractsConfig::default(),
             app_settings: AppSettings::default(),
         }
     }

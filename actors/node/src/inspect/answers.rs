@@ -258,7 +258,7 @@ fn guards(node: NodeAddress) -> (Vec<GuardReport>, u64) {
     let mut outputs = outputs();
     outputs.retain(|output| output.data_id.destination.node == node);
     let left_out = outputs.len().saturating_sub(LISTED_MAX) as u64;
-    let report = |OutputState { data_id, state, is_safe_failed }| GuardReport {
+    let report = |OutputState { data_id, state, is_safe_failed, .. }| GuardReport {
         receiver: data_id.destination,
         sender: data_id.source,
         kind_name: data_id.name.to_owned(),

@@ -10,6 +10,7 @@ use std::{
     time::Duration,
 };
 
+use sinew_model::contracts::AskContracts;
 use sinew_runtime::{
     log,
     outcome::{Outcome, Rejection},
@@ -22,7 +23,7 @@ use sinew_runtime::{
 use super::{
     access::{self, Readings},
     answers::Answers,
-    frozen, logs, reach, record,
+    contracts, frozen, logs, reach, record,
     reports::{
         AskAccess, AskApps, AskAudit, AskFreeze, AskFrozen, AskGroups, AskLogs, AskMismatches, AskNode,
         AskReach, AskRecord, AskReload, AskSchemas, AskTree, AskWatch, Report, WatchReport,
@@ -136,6 +137,7 @@ fn answer(
         }
         AskFreeze::KIND => reply(answers, number, &question, |_, state| frozen::triggered(state, &question)),
         AskFrozen::KIND => reply(answers, number, &question, |_, state| frozen::fetched(state, &question)),
+        AskContracts::KIND => reply(answers, number, &question, |_, state| contracts::declared(state)),
         AskLogs::KIND => reply(answers, number, &question, |_, state| logs::kept(state, &question)),
         AskSchemas::KIND => reply(answers, number, &question, |_, state| types::schemas(state, &question)),
         AskMismatches::KIND => reply(answers, number, &question, |_, state| types::mismatches(state)),

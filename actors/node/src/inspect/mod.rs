@@ -18,11 +18,13 @@
 //! | INSPECT-9 | A recording is started by a program of the node's own host and user, or of root, for at most 8 of them, and ends 5 s after its last question. It writes the selected messages into a journal. The answer has its path, and the structure of at most 32 payload types that the question names. No sender waits for it. |
 //! | INSPECT-10 | A span is frozen for a program of the node's own host and user, or of root. Frozen spans are read by such programs, and by programs of other nodes. A node sends such a question of a guest to no other node. |
 //! | INSPECT-11 | A node hands out the newest lines of its log, of any level that is logged: at most 2,048 lines and 256 KiB of text are kept. An answer has at most 256 lines and 32 KiB of text, from the requested number on, and counts the lines that are not kept. No thread that logs waits for it. |
+//! | INSPECT-12 | A node hands out the contracts of its applications, and the outputs that these guard in its process: at most 256 of each. Nothing is checked or measured for an answer. |
 //!
 //! `docs/protocol/inspect.md` lists the fields.
 
 mod access;
 mod answers;
+mod contracts;
 mod frozen;
 mod inspector;
 mod logs;
@@ -35,6 +37,7 @@ mod tests;
 mod types;
 mod watches;
 
+pub(crate) use contracts::Contracts;
 pub(crate) use inspector::begin;
 #[cfg(test)]
 pub(crate) use record::recorded;

@@ -3,6 +3,7 @@
 mod access;
 mod apps;
 mod audit;
+mod contracts;
 mod frozen;
 mod guards;
 mod logs;

@@ -1,5 +1,6 @@
 //! Requests to the inspection: answered within bounds, refused, or too many.
 
+mod contracts;
 mod guards;
 mod left_out;
 

@@ -103,6 +103,7 @@ impl Root {
             StartError::Application { name: app.name().to_owned(), why: error.to_string() }
         })?;
         self.state.types.register(tid.app, app.types(), app.sends());
+        self.state.contracts.register(tid, app);
         let directory = Arc::new(NodeDirectory(self.state.clone()));
         let sender = Sender::new(tid, self.state.ctx.router.clone(), directory, pending, config.payload_max);
         let id = self.child_ids.next();

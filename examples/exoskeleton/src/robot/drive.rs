@@ -140,6 +140,7 @@ fn spec_with<G: DriveGains>(parts: DriveParts, place: Place, gains: &Arc<G>) -> 
         .handles::<EmergencyStop>()
         .handles::<Reset>()
         .requires([sensor])
+        .contract(command::contract())
         .start_within(AS_LONG_AS_IT_TAKES)
         .place(place)
 }

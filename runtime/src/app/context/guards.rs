@@ -84,6 +84,9 @@ impl<A: Actor<Context = Self>> AppContext<A> {
             let node = (self.sender.clock(), self.sender.stop());
             Guard::new_on::<P>(node, (source, self.tid()), output, safe)?
         };
+        if self.sender.runs_dry() {
+            guard.begin_dry_run();
+        }
         let guarded = guard.guarded();
         self.sender.add_guarded_here();
         let protection =

@@ -6,7 +6,7 @@ use sinew_params::Parameters;
 
 use super::{AppWiring, Common, DynApp};
 use crate::{
-    app::{DownState, RequirementPolicy, WILLS_MAX, Will},
+    app::{DownState, RequirementPolicy, WILLS_MAX, Will, contract},
     supervision::{Launch, Place, Policy},
     tid::AppAddress,
     wire::{Kind, PayloadType},
@@ -101,7 +101,7 @@ impl DynApp {
     /// Returns the error in the declaration, as a text, if it has one.
     #[must_use]
     pub fn fault(&self) -> Option<String> {
-        let Common { wills, on_lost, has_safe_state, parameter_sets, .. } = &self.common;
+        let Common { wills, on_lost, has_safe_state, parameter_sets, contracts, .. } = &self.common;
         if wills.len() > WILLS_MAX {
             let wills = wills.len();
             return Some(format!("{wills} last wills are more than the {WILLS_MAX} that it may have"));
@@ -110,6 +110,9 @@ impl DynApp {
             return Some(format!(
                 "it has {parameter_sets} sets of parameters, and may have one: put all into one `params!`"
             ));
+        }
+        if let Some(why) = contract::fault(self.name(), contracts) {
+            return Some(why);
         }
         match on_lost {
             RequirementPolicy::SafeState if !has_safe_state => {

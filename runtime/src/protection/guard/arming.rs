@@ -29,6 +29,8 @@ impl<O: Send + 'static> Guard<O> {
                 }
                 receiver.arm(now)
             })?;
+            // The output is live: its safe function is not called without a cause.
+            inner.dry_run = None;
             // SYNC: after the output was counted as live. A stop that was pressed meanwhile has seen that count, or is
             // seen here.
             if shared.watch.must_stop() {

@@ -31,7 +31,8 @@ fn messages_do_not_delay_the_retry_after_a_panic() {
     let data_id = DataId { source: tid(1), destination: tid(2), name: "test.torque" };
     let receiver = Receiver::new(Protection::of_period(SAFE_RETRY));
     let safe = Box::new(|(): &mut (), _| panic!("a planted panic"));
-    let mut inner = Inner { data_id, receiver, output: (), safe, retry: None, log_entry: None };
+    let mut inner =
+        Inner { data_id, receiver, output: (), safe, retry: None, dry_run: None, log_entry: None };
     let started = Time::from_nanos(1_000_000_000);
     inner.make_safe(Cause::Tripped, started);
     let due = (started + SAFE_RETRY).as_nanos();

@@ -6,6 +6,7 @@ mod attacks;
 mod barriers;
 mod client_kills;
 mod conservation;
+mod contracts;
 mod faulty_network;
 mod growth;
 mod hostile_client;
@@ -28,6 +29,7 @@ enum Scenario {
     Barriers(barriers::Arguments),
     ClientKills(client_kills::Arguments),
     Conservation(conservation::Arguments),
+    Contracts(contracts::Arguments),
     FaultyNetwork(faulty_network::Arguments),
     Growth(growth::Arguments),
     HostileClient(hostile_client::Arguments),
@@ -48,6 +50,7 @@ fn main() -> ExitCode {
         Scenario::Barriers(arguments) => barriers::execute(arguments),
         Scenario::ClientKills(arguments) => client_kills::execute(arguments),
         Scenario::Conservation(arguments) => conservation::execute(arguments),
+        Scenario::Contracts(arguments) => contracts::execute(arguments),
         Scenario::FaultyNetwork(arguments) => faulty_network::execute(arguments),
         Scenario::Growth(arguments) => growth::execute(arguments),
         Scenario::HostileClient(arguments) => hostile_client::execute(arguments),

@@ -60,7 +60,7 @@ enum Kind {
 }
 
 /// Sections, in the order of the file, with a heading.
-const SECTIONS: [(&str, &str); 11] = [
+const SECTIONS: [(&str, &str); 12] = [
     ("node", "The node"),
     ("lncl", "Applications of this host"),
     ("gncl", "Connections between nodes"),
@@ -72,6 +72,7 @@ const SECTIONS: [(&str, &str); 11] = [
     ("record", "The recording"),
     ("rt", "The proof of real time"),
     ("stop", "The stop of the whole system"),
+    ("contracts", "Contracts of applications"),
 ];
 
 /// Longest cell of a table, and longest line of the complete file.

@@ -3,7 +3,8 @@
 use std::io;
 
 use exoskeleton_model::message::{DriveState, GaitState};
-use sinew::prelude::{AppContext, Delivery, Tid};
+use sinew::contracts::Contract;
+use sinew::prelude::{AppContext, Delivery, Duration, Tid};
 use sinew::protection::{ArmError, Guard, State};
 use sinew::time::Clock;
 
@@ -11,7 +12,16 @@ use super::anomaly::Anomaly;
 use super::damping_repeater::RepeaterHandle;
 use super::{Drive, SILENCE_MAX};
 use crate::robot::device::Damper;
-use crate::robot::edges::Arm;
+use crate::robot::edges::{Arm, GAIT};
+
+/// Time from central's last command until the device is ordered to damp: up to 60 ms of age and 10 ms of silence, and
+/// the node's slack. Only a network that delays commands by as much as they may be old makes it that long.
+const DAMPED_WITHIN: Duration = Duration::from_millis(100);
+
+/// Returns the drive's contract with central. A command is late as soon as it is too old for a new torque.
+pub(super) fn contract() -> Contract {
+    Contract::when_lost(GAIT).or_late(SILENCE_MAX).or_stopped().goes_to("damped", DAMPED_WITHIN)
+}
 
 /// The commands of central.
 pub(super) struct CentralCommands {

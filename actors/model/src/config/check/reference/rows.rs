@@ -468,6 +468,20 @@ pub(super) const ROWS: &[Row] = &[
         effect: "Whether this node presses the stop of the whole system when it loses another node without its farewell.",
         note: "A node that is cut off then stops by itself, also where it commands its own outputs.",
     },
+    Row {
+        key: "contracts.dry_run",
+        kind: Kind::Truth,
+        value: |config| json!(config.contracts.dry_run),
+        effect: "Whether each output is measured by a dry run, before it is armed; `sinew contracts` shows the time.",
+        note: "Its safe function is called once more by that.",
+    },
+    Row {
+        key: "contracts.slack_ms",
+        kind: Kind::Number(SLACK),
+        value: |config| millis(config.contracts.slack),
+        effect: "Time that the checks of contracts add for a late thread and for the safe function itself.",
+        note: "A dry run that takes longer is a finding.",
+    },
 ];
 
 fn millis(duration: Duration) -> Value {

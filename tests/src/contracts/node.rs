@@ -1,0 +1,197 @@
+//! The role of a node: `central` sends commands, the others obey them with a guarded output and a contract.
+
+use std::{
+    io::BufRead,
+    net::SocketAddrV4,
+    path::PathBuf,
+    sync::{
+        Arc, Mutex, PoisonError,
+        atomic::{AtomicU64, Ordering},
+    },
+};
+
+use sinew::{
+    contracts::{AskContracts, Closure, Contract, ContractsReport},
+    message::Sender,
+    prelude::*,
+    protection::{Guard, Protection, State},
+    stop::{ReleaseStop, StopReport},
+};
+use sinew_testkit::{
+    DEADLINE,
+    scripted::{sender_app, wait},
+};
+
+use super::NODES;
+
+const PERIOD: Duration = Duration::from_millis(20);
+/// Age of the newest command from which its sender is late.
+pub const LATE: Duration = Duration::from_millis(100);
+/// Time from the last command to a safe output: 160 ms of age, and 60 ms of silence. The contracts add the slack.
+pub const WATCHDOG: Duration = Duration::from_millis(220);
+const CONTROL: AppAddress = AppAddress::new(0x1001);
+/// How long a release waits for the other nodes.
+const RELEASED_WITHIN_MS: u32 = 10_000;
+
+/// A protected command.
+#[derive(serde::Serialize, serde::Deserialize)]
+struct Torque {
+    newton_metres: f32,
+}
+
+impl Payload for Torque {
+    const NAME: &'static str = "contracts.torque";
+    const PROTECTION: Option<Protection> = Some(Protection::of_period(PERIOD));
+}
+
+/// Commands the outputs of the other nodes.
+struct Control;
+
+impl Actor for Control {
+    type Context = AppContext<Self>;
+
+    fn started(&mut self, context: &mut Self::Context) {
+        context.every(PERIOD, |_, _, context| {
+            for node in &NODES[1..] {
+                // A drive that is not there gets none.
+                let _ = context.send(&*format!("drive.{node}"), &Torque { newton_metres: 1.0 });
+            }
+        });
+    }
+}
+
+/// The output, as the orders of the scenario see it.
+#[derive(Default)]
+struct View {
+    guard: Mutex<Option<Guard<()>>>,
+    safe_ns: AtomicU64,
+}
+
+impl View {
+    fn line(&self) -> String {
+        let guard = self.guard.lock().unwrap_or_else(PoisonError::into_inner);
+        let is_live = guard.as_ref().is_some_and(|guard| guard.state() == State::Live);
+        format!("{} {}", u8::from(is_live), self.safe_ns.load(Ordering::SeqCst))
+    }
+}
+
+struct Drive {
+    control: Tid,
+    view: Arc<View>,
+}
+
+impl Actor for Drive {
+    type Context = AppContext<Self>;
+
+    fn started(&mut self, context: &mut Self::Context) {
+        let view = self.view.clone();
+        let make_safe = move |(): &mut (), _| view.safe_ns.store(Time::now().as_nanos(), Ordering::SeqCst);
+        let guard = context.guard::<Torque, _>(self.control, (), make_safe).expect("there is the thread");
+        *self.view.guard.lock().unwrap_or_else(PoisonError::into_inner) = Some(guard.clone());
+        context.every(PERIOD, move |_, _, _| {
+            // A careless application: it acknowledges and arms whenever that is possible.
+            let _ = guard.acknowledge_stop();
+            let _ = guard.arm();
+        });
+    }
+}
+
+impl Handler<Delivery<Torque>> for Drive {
+    type Result = ();
+
+    fn handle(&mut self, _: Delivery<Torque>, _: &mut Self::Context) {}
+}
+
+/// `NUMBER GROUP PROJECT FOLDER SLACK_MS PLANT`. With the plant `missing` a drive declares no contract, with `short`
+/// one of too short a time, with `none` a correct one.
+pub(crate) fn run(arguments: &[String]) {
+    let [number, group, project, folder, slack, plant] = arguments else {
+        panic!("six arguments, not {arguments:?}")
+    };
+    let number: u8 = number.parse().expect("the scenario counts");
+    let group: SocketAddrV4 = group.parse().expect("the scenario's group");
+    let name = NODES[usize::from(number)];
+    let slack = Duration::from_millis(slack.parse().expect("milliseconds"));
+    let project = format!("contracts-{project}");
+    let socket = PathBuf::from(folder).join(format!("{name}.sock"));
+    let builder = Node::builder(name).address([127, 0, 0, number + 1]).configure(move |config| {
+        config.project.clone_from(&project);
+        config.lncl.socket = Some(socket.clone());
+        (config.ndl.multicast, config.ndl.mdns_port) = (Some(group), None);
+        config.ndl.period = Duration::from_millis(100);
+        config.rt.probe = Duration::ZERO;
+        (config.contracts.dry_run, config.contracts.slack) = (true, slack);
+    });
+    let (operator, key) = sender_app(&format!("operator.{name}"));
+    let view = Arc::new(View::default());
+    let builder = builder.app(operator);
+    let builder = if number == 0 {
+        builder.app(AppSpec::new("control", || Control).address(CONTROL).own_thread())
+    } else {
+        builder.app(drive(name, &view, WATCHDOG + slack, plant))
+    };
+    let node = builder.start().unwrap_or_else(|error| panic!("{error}"));
+    node.handle().wait_until_running(DEADLINE).expect("it requires nothing");
+    execute_orders(&key.sender(), node.handle().address(), &view);
+    node.stop();
+}
+
+fn drive(name: &str, view: &Arc<View>, within: Duration, plant: &str) -> AppSpec<Drive> {
+    let (shared, control) = (view.clone(), Tid::new([127, 0, 0, 1].into(), CONTROL));
+    let drive = AppSpec::new(format!("drive.{name}"), move || Drive { control, view: shared.clone() });
+    let within = match plant {
+        "missing" => None,
+        "short" => Some(within - Duration::from_millis(1)),
+        "none" => Some(within),
+        other => panic!("{other:?} is no plant"),
+    };
+    let contract = |within| Contract::when_lost("control").or_late(LATE).or_stopped().goes_to("safe", within);
+    let drive = drive.handles::<Torque>().own_thread();
+    match within {
+        Some(within) => drive.contract(contract(within)),
+        None => drive,
+    }
+}
+
+/// Executes the orders of the scenario, and prints one line for each.
+fn execute_orders(operator: &Sender, own: NodeAddress, view: &View) {
+    println!("up");
+    for line in std::io::stdin().lock().lines().map_while(Result::ok) {
+        let words: Vec<&str> = line.split(' ').collect();
+        match words[..] {
+            ["output"] => println!("{}", view.line()),
+            ["press", within_ms] => {
+                let within = Duration::from_millis(within_ms.parse().expect("milliseconds"));
+                let report = wait(operator.press_stop("the scenario", within).expect("there is room"));
+                println!("pressed {}", report.map(|report| report.nodes.len()).unwrap_or_default());
+            }
+            ["release"] => {
+                let stop = Tid::new(own, AppAddress::STOP);
+                let order = ReleaseStop { within_ms: RELEASED_WITHIN_MS };
+                let reply =
+                    operator.message(stop, &order).ask::<StopReport>(DEADLINE).expect("there is room");
+                let refused = wait(reply).unwrap_or_else(|error| panic!("no report: {error}")).refused;
+                println!("released {}", refused.unwrap_or_default());
+            }
+            ["check"] => println!("{}", check(operator)),
+            ["leave"] => return,
+            _ => panic!("{line:?} is no order"),
+        }
+    }
+}
+
+/// Checks the contracts of all nodes: whether they close, the number of their rows, and the longest dry run in
+/// microseconds, 0 for none.
+fn check(operator: &Sender) -> String {
+    let report = |number: u8| {
+        let inspect = Tid::new([127, 0, 0, number + 1].into(), AppAddress::INSPECT);
+        let asked = operator.message(inspect, &AskContracts {}).ask::<ContractsReport>(DEADLINE).ok()?;
+        wait(asked).ok()
+    };
+    let reports: Vec<_> = (0..NODES.len() as u8).filter_map(report).collect();
+    let closure = Closure::of(&reports);
+    let closes = closure.closes() && reports.len() == NODES.len();
+    let outputs = reports.iter().flat_map(|report| &report.outputs);
+    let measured = outputs.filter_map(|output| output.measured_us).max().unwrap_or_default();
+    format!("{} {} {measured}", u8::from(closes), closure.rows.len())
+}
