@@ -3,6 +3,7 @@
 mod assignment;
 mod file;
 mod list;
+mod together;
 
 use std::path::PathBuf;
 
@@ -42,13 +43,18 @@ pub(crate) enum Order {
         #[arg(value_name = "APP.NAME")]
         parameter: ParameterName,
     },
-    /// Sets parameters of an application: all of these values, at one tick of its loop, or none
+    /// Sets parameters: all of these values, at one tick of the application's loop, or none
     ///
     /// The command prints the tick, or the reason of the refusal. A value that is declared with a slope begins to move
     /// at that tick.
+    ///
+    /// Values of several applications are one transaction: each applies its values at its first tick at or after one
+    /// stated time, half a second later, or none does. The exit code is 1 if they did not all do so, and the command
+    /// names each.
     #[command(after_help = r#"Examples:
   sinew param set knee.drive.assistance=0.5
-  sinew param set knee.drive.assistance=0.5 knee.drive.damped=true"#)]
+  sinew param set knee.drive.assistance=0.5 knee.drive.damped=true
+  sinew param set knee.drive.assistance=0.2 hip.drive.assistance=0.2"#)]
     Set {
         /// The application, the parameter and its value
         #[arg(value_name = "APP.NAME=VALUE", required = true)]
@@ -91,8 +97,13 @@ pub(crate) fn show(system: &mut System, order: &Order, is_wide: bool) -> Result<
         Order::List { app } => list::show(system, app.as_deref(), is_wide),
         Order::Get { parameter } => get(system, parameter),
         Order::Set { values } => {
-            let (app, values) = assignment::one_set(values)?;
-            Ok(SetResult::of(system, app, &SetParameters::Values(values))?.report())
+            let mut sets = assignment::sets(values);
+            match sets.pop() {
+                Some((app, values)) if sets.is_empty() => {
+                    Ok(SetResult::of(system, &app, &SetParameters::Values(values))?.report())
+                }
+                last => together::set(system, sets.into_iter().chain(last).collect()),
+            }
         }
         Order::Undo { app } => Ok(SetResult::of(system, app, &SetParameters::Undo)?.report()),
         Order::Save { file, apps } => file::save(system, file, apps),
@@ -115,6 +126,9 @@ fn get(system: &mut System, parameter: &ParameterName) -> Result<Report, SystemE
     Ok(Report { text: format!("{}\n", found.value), json: list::parameter_json(found), is_fine: true })
 }
 
+/// The fault of an answer that belongs to no set of one application.
+const HELD: &str = "it answered with a state of a transaction: it has another version of Sinew; update both";
+
 /// The result of a set of parameters of one application.
 struct SetResult {
     app: String,
@@ -135,6 +149,7 @@ impl SetResult {
         match &self.outcome {
             Ok(ParameterOutcome::Applied { .. }) => None,
             Ok(ParameterOutcome::Refused { why }) | Err(why) => Some(why),
+            Ok(ParameterOutcome::Held { .. }) => Some(HELD),
         }
     }
 
@@ -143,6 +158,7 @@ impl SetResult {
         let (tick, at_ns, values) = match &self.outcome {
             Ok(ParameterOutcome::Applied { tick, at_ns, values }) => (tick, at_ns, values),
             Ok(ParameterOutcome::Refused { why }) => return format!("{app}: refused: {}\n", clean(why)),
+            Ok(ParameterOutcome::Held { .. }) => return format!("{app}: {HELD}\n"),
             Err(why) => return format!("{app}: {}\n", clean(why)),
         };
         let values: Vec<_> =
@@ -158,7 +174,9 @@ impl SetResult {
     fn json(&self) -> Json {
         let (tick, at_ns, values) = match &self.outcome {
             Ok(ParameterOutcome::Applied { tick, at_ns, values }) => (Some(tick), Some(at_ns), &values[..]),
-            Ok(ParameterOutcome::Refused { .. }) | Err(_) => (None, None, &[][..]),
+            Ok(ParameterOutcome::Refused { .. } | ParameterOutcome::Held { .. }) | Err(_) => {
+                (None, None, &[][..])
+            }
         };
         let values = values.iter().map(|one| json!({ "name": one.name, "value": value_json(one.value) }));
         json!({

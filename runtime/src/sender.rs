@@ -9,6 +9,7 @@ mod groups;
 mod reply;
 mod sent_types;
 mod stop;
+mod transaction;
 mod unknown_name;
 
 use std::{

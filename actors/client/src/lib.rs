@@ -196,6 +196,7 @@ mod stall_timeout;
 mod stop;
 #[cfg(test)]
 mod tests;
+mod transaction;
 mod undelivered;
 mod wait_mode;
 
@@ -211,3 +212,4 @@ pub use node_api::NodeApi;
 pub use received::Received;
 pub use registration::Registration;
 pub use sinew_shm::Spin;
+pub use transaction::SetTogetherError;

@@ -74,6 +74,7 @@ impl Actor for Tuner {
                         let at = Time::from_nanos(at_ns).since(START);
                         note(ctx, format!("tick {tick} after {at:?}"));
                     }
+                    ParameterOutcome::Held { stated_ns, .. } => note(ctx, format!("held until {stated_ns}")),
                     ParameterOutcome::Refused { why } => note(ctx, why),
                 }));
             });

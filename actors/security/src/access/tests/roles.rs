@@ -1,7 +1,7 @@
 //! Roles: operators may set parameters, observers may read them.
 
 use sinew_runtime::{
-    parameters::{AskParameters, SetParameters},
+    parameters::{AskParameters, ParameterVote, SetParameters},
     router::guard::Guard as _,
     wire::Payload,
 };
@@ -66,6 +66,21 @@ fn reply_sets_no_parameters_without_the_role() {
     };
     assert!(may_reply(Kind::named("test.answer"), 1));
     assert!(!may_reply(SetParameters::KIND, 2));
+}
+
+#[test]
+fn participants_of_a_transaction_agree_without_a_rule() {
+    let place = place();
+    let access = place.access("");
+    let target = AppAddress::new(0x1001);
+    let vote = |source, destination| Header::new(ParameterVote::KIND, source, Tid::new(HERE, destination));
+    assert!(access.allows(&vote(app(THERE, 0x1005), target), target));
+    // Not to many, and not from a guest.
+    let group = Tid::group("drives").app;
+    assert!(!access.allows(&vote(app(THERE, 0x1005), group), target));
+    let guest = AppAddress::new(0x1006);
+    access.add_guest(guest, rustix::process::geteuid().as_raw() + 7);
+    assert!(!access.allows(&vote(Tid::new(HERE, guest), target), target));
 }
 
 #[test]
