@@ -101,7 +101,7 @@ fn play_kill(robot: &mut Robot, round: Round, report: &mut Report) {
     let is_new = judge_living(robot, round, report);
     robot.start_node(victim);
     if coordinator == victim {
-        // Nobody is left to repair: the node has its default, as after each restart.
+        // No coordinator is left to repair: the node has its default, as after each restart.
         report.coordinators_killed += 1;
         return;
     }

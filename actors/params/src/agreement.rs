@@ -42,7 +42,7 @@ pub(crate) struct Times {
     pub(crate) apply_at: Duration,
 }
 
-/// What one participant knows of a transaction.
+/// The knowledge of one participant about a transaction.
 #[derive(Debug)]
 pub(crate) struct Agreement {
     id: TransactionId,

@@ -1,7 +1,7 @@
 //! The coordinator of a transaction: it begins one, asks for the outcomes, and repairs a mixed one. Pure: times are
 //! arguments, and the caller sends.
 //!
-//! The participants agree without it ([`agreement`](crate::agreement)): if it ends after the begin, they go on.
+//! The participants agree without it ([`agreement`](crate::agreement)): if it ends after the begin, they need it no more.
 
 use std::{collections::BTreeSet, time::Duration};
 
@@ -141,7 +141,7 @@ pub struct Coordinator {
     /// The participants that are asked in this round.
     round: BTreeSet<usize>,
     next_round: Duration,
-    /// The participant whose reply is awaited.
+    /// The participant that was asked last, until its reply.
     asked: Option<usize>,
 }
 

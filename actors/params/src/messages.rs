@@ -60,11 +60,11 @@ pub struct Participant {
 pub struct ParameterVote {
     /// The transaction.
     pub transaction: TransactionId,
-    /// What the sender knows.
+    /// The knowledge of the sender.
     pub stance: Stance,
 }
 
-/// What a participant knows of a transaction.
+/// The knowledge of a participant about a transaction.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Stance {
     /// It holds legal values, and counts acceptances still.

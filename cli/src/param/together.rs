@@ -192,7 +192,7 @@ mod tests {
     }
 
     #[test]
-    fn each_application_has_its_tick_and_distance_from_the_stated_time() {
+    fn each_application_has_its_tick_and_lateness() {
         let applied = PartOutcome::Applied { tick: 7, at_ns: 2_000_900_000 };
         let report = report_of(TransactionVerdict::All, vec![part("knee", applied)]);
         let line = "knee: gain = 0.2: applied at tick 7, at 2.000900000 s of its host's clock, 0.900 ms after the stated \

@@ -115,7 +115,7 @@ fn set_from_another_node_uses_the_application_socket() {
 }
 
 #[test]
-fn applications_of_two_nodes_are_set_together_or_not_at_all() {
+fn applications_of_two_nodes_are_set_together() {
     // Given: two nodes, each with an application that has parameters
     let scenario = Scenario::new();
     let mut nodes = [scenario.start("hip", 1, &["--tuned"]), scenario.start("knee", 2, &["--tuned"])];

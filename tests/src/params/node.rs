@@ -33,7 +33,7 @@ params! {
     }
 }
 
-/// What the loop has read last, and since when.
+/// The value that the loop has read last, and since when.
 #[derive(Default)]
 struct View {
     value: AtomicU64,

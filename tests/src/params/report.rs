@@ -19,9 +19,9 @@ pub struct Report {
     pub complete: u32,
     /// Transactions that no node has applied.
     pub without_effect: u32,
-    /// Transactions whose killed node got the values after its restart.
+    /// Transactions of which the killed node got the values after its restart.
     pub repaired: u32,
-    /// Transactions whose coordinator was killed. The living nodes alone are judged.
+    /// Transactions without their coordinator, which was killed. The living nodes alone are judged.
     pub coordinators_killed: u32,
     /// Transactions in which a node was cut off.
     pub cuts: u32,
@@ -77,8 +77,8 @@ impl fmt::Display for Report {
             ("the coordinator's node was killed", self.coordinators_killed),
             ("a node was cut off", self.cuts),
         ];
-        for (what, count) in counts {
-            writeln!(f, "{what:<48} {count:>6}")?;
+        for (case, count) in counts {
+            writeln!(f, "{case:<48} {count:>6}")?;
         }
         writeln!(f, "{:<48} {:>6} {:>9} {:>9} {:>9}", "", "count", "p50 ms", "p99 ms", "max ms")?;
         write!(f, "{:<48} {}", "first to last tick of a transaction", self.spread)

@@ -18,7 +18,7 @@ use crate::{
 /// Maximum number of transactions with a known outcome. The oldest one is forgotten.
 const CONCLUDED_MAX: usize = 16;
 
-/// Time between two looks at whether an application without a next tick can apply what is agreed on: its timer may have
+/// Time between two looks at whether an application without a next tick can apply agreed values: its timer may have
 /// been cancelled.
 const APPLY_AGAIN: Duration = Duration::from_millis(100);
 
@@ -49,7 +49,7 @@ impl Transactions {
         self.current.as_ref().is_some_and(|current| current.is_holding)
     }
 
-    /// Ends a doubt, as another set was accepted: what is agreed on before it does not apply after it.
+    /// Ends a doubt, as another set was accepted: values that were agreed on before it do not apply after it.
     pub(super) fn supersede(&mut self) {
         self.current = self.current.take().filter(|current| current.is_holding);
     }
@@ -123,7 +123,7 @@ impl Transactions {
         self.outbox.push_back((from, ParameterVote { transaction, stance: answer }));
     }
 
-    /// Takes the values whose stated time has come, if all have accepted.
+    /// Takes the transaction that is due, if all have accepted.
     fn take_due(&mut self, now: Duration) -> Option<Current> {
         self.advance(now);
         let is_due = |current: &mut Current| {
@@ -202,7 +202,7 @@ impl<T> Tuner<T> {
         self.transactions.advance(now);
     }
 
-    /// Applies the values of a transaction whose stated time has come.
+    /// Applies the values of a transaction at or after its stated time.
     pub(super) fn apply_transaction(&mut self, tick: u64, now: Duration) {
         let Some(Current { agreement, values, is_holding, .. }) = self.transactions.take_due(now) else {
             return;
@@ -218,7 +218,7 @@ impl<T> Tuner<T> {
     }
 }
 
-/// Returns the times of a transaction whose message was sent at `sent`, on this clock.
+/// Returns the times of a transaction on this clock. Its message was sent at `sent`.
 fn times(transaction: &ParameterTransaction, sent: Duration) -> Result<Times, ParameterError> {
     let lead = Duration::from_nanos(transaction.lead_ns);
     let applies_after = Duration::from_nanos(transaction.applies_after_ns);

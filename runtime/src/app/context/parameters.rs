@@ -168,7 +168,7 @@ impl<A: Actor<Context = Self>> AppContext<A> {
         Outcome::Delivered
     }
 
-    /// Sends what the other participants of a transaction are to know, and sets the timer of its next step.
+    /// Sends the messages to the other participants of a transaction, and sets the timer of its next step.
     fn send_votes(&mut self) {
         if let Some(tuner) = &mut self.tuning.tuner {
             while let Some((to, vote)) = tuner.take_vote() {
@@ -213,7 +213,7 @@ impl<A: Actor<Context = Self>> AppContext<A> {
     pub(in crate::app) fn expire_parameters(&mut self, now: Time) {
         self.tuning.expiry = None;
         if self.tuning.timer().is_none() {
-            // What is agreed on applies between two messages.
+            // Agreed values apply between two messages.
             self.apply_parameters((0, Duration::ZERO), now);
         } else if let Some(tuner) = &mut self.tuning.tuner {
             tuner.expire(since_origin(now), |to, outcome| reply(&self.sender, to, &outcome));

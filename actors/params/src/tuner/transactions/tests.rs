@@ -86,7 +86,7 @@ fn is_agreed(tuner: &mut Tuner<u32>, now: Duration) -> bool {
 }
 
 #[test]
-fn agreed_values_apply_at_the_first_tick_at_or_after_the_stated_time() {
+fn agreed_values_apply_at_the_stated_time() {
     let steps = steps();
     let mut tuner = Tuner::new(steps.clone(), ms(0));
     let held = prepare(&mut tuner, &transaction(2), ms(1)).expect("it is legal");
@@ -132,7 +132,7 @@ fn missing_acceptance_applies_nothing_and_is_named() {
 }
 
 #[test]
-fn late_result_is_applied_at_the_next_tick_and_reported_once() {
+fn late_result_is_applied_at_the_next_tick() {
     let steps = steps();
     let mut tuner = Tuner::new(steps.clone(), ms(0));
     prepare(&mut tuner, &transaction(2), ms(1)).expect("it is legal");
@@ -237,7 +237,7 @@ fn cut_off_node_follows_when_it_is_back() {
     assert!(late > 5, "only {late} cuts came between the acceptances");
 }
 
-/// Without faults each transaction is applied by all, whatever the clocks and periods.
+/// Without faults each transaction is applied by all, with any clocks and periods.
 #[test]
 fn transaction_without_faults_is_applied_by_all() {
     for seed in 0..500 {

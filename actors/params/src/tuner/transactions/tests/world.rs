@@ -318,7 +318,7 @@ impl World {
         }
     }
 
-    /// Sends what the tuner has to send, and sets its timer.
+    /// Sends the tuner's messages, and sets its timer.
     fn flush(&mut self, index: usize) {
         let now = self.now;
         let node = &mut self.nodes[index];
