@@ -125,6 +125,10 @@ impl SendTerms {
     /// No overrides.
     pub(super) const PLAIN: Self = Self { room_within: None, expires_after: None, class: None };
 
+    /// Without a wait for room.
+    pub(super) const AT_ONCE: Self =
+        Self { room_within: Some(Duration::ZERO), expires_after: None, class: None };
+
     /// Returns how long a send waits for room.
     pub(super) fn limit(&self, endpoint: &Endpoint) -> Limit {
         self.room_within.map_or_else(|| endpoint.stall_timeout(), Limit::in_all)
