@@ -81,8 +81,8 @@ pub(crate) enum Order {
     },
     /// Sets the values of a file that `save` has written
     ///
-    /// The values of one application are one set. Each application is set by itself: if one refuses, others may have
-    /// been set, and the command names them.
+    /// The values of one application are one set, and those of up to 16 applications are one transaction, as for `set`:
+    /// all are set, or none is. Of more applications each 16 are one.
     #[command(after_help = r#"Examples:
   sinew param load walk.toml"#)]
     Load {
@@ -96,18 +96,20 @@ pub(crate) fn show(system: &mut System, order: &Order, is_wide: bool) -> Result<
     match order {
         Order::List { app } => list::show(system, app.as_deref(), is_wide),
         Order::Get { parameter } => get(system, parameter),
-        Order::Set { values } => {
-            let mut sets = assignment::sets(values);
-            match sets.pop() {
-                Some((app, values)) if sets.is_empty() => {
-                    Ok(SetResult::of(system, &app, &SetParameters::Values(values))?.report())
-                }
-                last => together::set(system, sets.into_iter().chain(last).collect()),
-            }
-        }
+        Order::Set { values } => set_all(system, assignment::sets(values)),
         Order::Undo { app } => Ok(SetResult::of(system, app, &SetParameters::Undo)?.report()),
         Order::Save { file, apps } => file::save(system, file, apps),
         Order::Load { file } => file::load(system, file),
+    }
+}
+
+/// Sets parameters: of one application as a set, of several as a transaction.
+fn set_all(system: &mut System, mut sets: Vec<(String, Vec<NamedValue>)>) -> Result<Report, SystemError> {
+    match sets.pop() {
+        Some((app, values)) if sets.is_empty() => {
+            Ok(SetResult::of(system, &app, &SetParameters::Values(values))?.report())
+        }
+        last => together::set(system, sets.into_iter().chain(last).collect()),
     }
 }
 
