@@ -45,9 +45,9 @@ pub struct MessageBuilder<'a, E, C> {
 /// The settings of one call that override those of its type and its endpoint.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct SendTerms {
-    room_within: Option<Duration>,
-    expires_after: Option<Duration>,
-    class: Option<Class>,
+    pub(super) room_within: Option<Duration>,
+    pub(super) expires_after: Option<Duration>,
+    pub(super) class: Option<Class>,
 }
 
 /// A value and its destination.
@@ -124,10 +124,6 @@ impl Content for LoanedMessage {
 impl SendTerms {
     /// No overrides.
     pub(super) const PLAIN: Self = Self { room_within: None, expires_after: None, class: None };
-
-    /// Without a wait for room.
-    pub(super) const AT_ONCE: Self =
-        Self { room_within: Some(Duration::ZERO), expires_after: None, class: None };
 
     /// Returns how long a send waits for room.
     pub(super) fn limit(&self, endpoint: &Endpoint) -> Limit {

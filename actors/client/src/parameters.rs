@@ -65,6 +65,9 @@ pub struct EndpointParameters {
     replies: Vec<(Received, Answer)>,
 }
 
+/// Sends without a wait for room.
+const AT_ONCE: SendTerms = SendTerms { room_within: Some(Duration::ZERO), ..SendTerms::PLAIN };
+
 enum Answer {
     List(ParameterList),
     Outcome(ParameterOutcome),
@@ -242,16 +245,14 @@ impl EndpointParameters {
         for (request, answer) in self.replies.drain(..) {
             let to = request.source();
             let _: Result<(), ApiError> = match &answer {
-                Answer::List(list) => {
-                    endpoint.reply_as(&request, Value::new(to, list), SendTerms::AT_ONCE).await
-                }
+                Answer::List(list) => endpoint.reply_as(&request, Value::new(to, list), AT_ONCE).await,
                 Answer::Outcome(outcome) => {
-                    endpoint.reply_as(&request, Value::new(to, outcome), SendTerms::AT_ONCE).await
+                    endpoint.reply_as(&request, Value::new(to, outcome), AT_ONCE).await
                 }
             };
         }
         while let Some((to, vote)) = self.tuner.take_vote() {
-            let _ = endpoint.send_as(Value::new(Tid::from_bits(to), &vote), SendTerms::AT_ONCE).await;
+            let _ = endpoint.send_as(Value::new(Tid::from_bits(to), &vote), AT_ONCE).await;
         }
     }
 }

@@ -77,7 +77,7 @@ impl Endpoint {
     ) -> Result<TransactionReport, SetTogetherError> {
         let mut named = Vec::new();
         for (app, values) in sets {
-            let tid = self.resolve(&app, RESOLVED_WITHIN)?;
+            let tid = self.resolve(&app, RESOLVED_WITHIN)?.map(|tid| self.absolute(tid));
             named.push((participant(app, tid)?, values));
         }
         let began = since_origin(Time::now());
@@ -108,7 +108,7 @@ impl AsyncEndpoint {
     ) -> Result<TransactionReport, SetTogetherError> {
         let mut named = Vec::new();
         for (app, values) in sets {
-            let tid = self.resolve(&app, RESOLVED_WITHIN).await?;
+            let tid = self.resolve(&app, RESOLVED_WITHIN).await?.map(|tid| self.endpoint.absolute(tid));
             named.push((participant(app, tid)?, values));
         }
         let began = since_origin(Time::now());

@@ -1,9 +1,10 @@
 //! One participant's part in the agreement on a transaction. Pure: times are arguments.
 //!
-//! Each participant sends its acceptance to all others. One that has the acceptances of all in the first half of the
-//! lead knows that the transaction is agreed on, and says so to all others; so does each one that learns it. In the
-//! second half the others ask for the result. No coordinator is needed for that. A participant that does not know the
-//! result at the stated time applies nothing, and asks for [`DOUBT_WITHIN`] more.
+//! Each participant sends its acceptance to those before it in the list, which answer by their own, and repeats it to
+//! all. One that has the acceptances of all in the first half of the lead knows that the transaction is agreed on, and
+//! says so to all others; so does each one that learns it. In the second half the others ask for the result. No
+//! coordinator is needed for that. A participant that does not know the result at the stated time applies nothing, and
+//! asks for [`DOUBT_WITHIN`] more.
 //! `docs/decisions/0053-parameter-transactions.md` has the failure cases.
 
 use std::{
@@ -11,7 +12,7 @@ use std::{
     time::Duration,
 };
 
-use crate::{ParameterVote, Participant, Stance, TransactionId};
+use crate::{ParameterTransaction, ParameterVote, Participant, Stance, TransactionId};
 
 /// Maximum number of applications in a transaction: each one sends to each other one.
 pub const PARTICIPANTS_MAX: usize = 16;
@@ -76,11 +77,10 @@ enum Phase {
 }
 
 impl Agreement {
-    /// Creates the part of a participant that accepts. `participants` may have itself, as `own`.
+    /// Creates the part of the participant `own`, which accepts. `participants` may have itself.
     pub(crate) fn new(
-        id: TransactionId,
+        ParameterTransaction { id, participants, .. }: &ParameterTransaction,
         own: u64,
-        participants: &[Participant],
         times: Times,
         now: Duration,
         outbox: &mut Outbox,
@@ -88,11 +88,15 @@ impl Agreement {
         let peer = |one: &Participant| Peer { app: one.app.clone(), has_accepted: false, has_nothing: false };
         let others = participants.iter().filter(|one| one.tid != own);
         let peers = others.map(|one| (one.tid, peer(one))).collect();
-        let mut agreement = Self { id, times, peers, phase: Phase::Open, next_send: now, is_overdue: false };
+        let next_send = now + RESEND;
+        let mut agreement = Self { id: *id, times, peers, phase: Phase::Open, next_send, is_overdue: false };
         if agreement.peers.is_empty() {
             agreement.phase = Phase::Committed;
         }
-        agreement.on_time(now, outbox);
+        // The coordinator begins in the order of the list. Later ones answer when they have the transaction, too.
+        for earlier in participants.iter().take_while(|one| one.tid != own) {
+            agreement.send(earlier.tid, Stance::Accepts, outbox);
+        }
         agreement
     }
 

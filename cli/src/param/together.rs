@@ -34,7 +34,10 @@ struct Ways<'a> {
 pub(super) fn set(system: &mut System, sets: Vec<(String, Vec<NamedValue>)>) -> Result<Report, SystemError> {
     let mut named = Vec::new();
     for (app, values) in sets {
-        let to = system.find(&app)?;
+        let mut to = system.find(&app)?;
+        if to.node == NodeAddress::HERE {
+            to.node = system.endpoint.tid().node;
+        }
         named.push((Participant { tid: to.bits(), app }, values));
     }
     let (coordinator, within) = (system.endpoint.tid().bits(), system.within);

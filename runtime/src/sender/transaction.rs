@@ -57,7 +57,7 @@ impl Sender {
             let mut named = Vec::new();
             for (app, values) in sets {
                 let tid = sender.resolve(&app).ok_or_else(|| TransactionError::UnknownName(app.clone()))?;
-                named.push((Participant { tid: tid.bits(), app }, values));
+                named.push((Participant { tid: sender.absolute(tid).bits(), app }, values));
             }
             let began = since_origin(sender.now());
             let mut transaction = Coordinator::begin(sender.tid().bits(), named, (lead, within), began)?;

@@ -166,11 +166,10 @@ impl<T> Tuner<T> {
             return Err(ParameterError::TooLate);
         }
         let values = self.check(&transaction.values, has_ticks)?;
-        let (id, participants) = (transaction.id, &transaction.participants);
-        let agreement = Agreement::new(id, own, participants, times, now, &mut self.transactions.outbox);
+        let agreement = Agreement::new(transaction, own, times, now, &mut self.transactions.outbox);
         self.transactions.current =
             Some(Current { agreement, values, bound, is_holding: true, apply_at: times.apply_at });
-        let held = self.transactions.outcome_of(id);
+        let held = self.transactions.outcome_of(transaction.id);
         Ok(held.unwrap_or_else(|| refused(&ParameterError::UnknownTransaction)))
     }
 

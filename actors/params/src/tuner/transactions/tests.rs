@@ -91,7 +91,8 @@ fn agreed_values_apply_at_the_stated_time() {
     let mut tuner = Tuner::new(steps.clone(), ms(0));
     let held = prepare(&mut tuner, &transaction(2), ms(1)).expect("it is legal");
     assert_eq!(held, ParameterOutcome::Held { stated_ns: 100_000_000, bound_ns: 0, is_agreed: false });
-    assert_eq!(stances(&mut tuner), [(2, Stance::Accepts)]);
+    // The second one sends its acceptance when it has the transaction.
+    assert!(stances(&mut tuner).is_empty());
     vote(&mut tuner, ms(2), 2, Stance::Accepts);
     assert_eq!(stances(&mut tuner), [(2, Stance::Commits)]);
     assert!(is_agreed(&mut tuner, ms(2)));
@@ -108,6 +109,24 @@ fn agreed_values_apply_at_the_stated_time() {
     tuner.stage(&SetParameters::Undo, (1, ms(900)), true).expect("there is one");
     tick(&mut tuner, 50, ms(510));
     assert_eq!(steps.0.get(), OLD);
+}
+
+#[test]
+fn acceptance_goes_to_earlier_ones_and_is_repeated() {
+    let mut tuner = Tuner::new(steps(), ms(0));
+    let sent = Some((ms(0), ms(0)));
+    tuner.prepare(&transaction(4), 3, sent, ms(1), true).expect("it is legal");
+    assert_eq!(stances(&mut tuner), [(1, Stance::Accepts), (2, Stance::Accepts)]);
+    // The first one of each other is answered.
+    vote(&mut tuner, ms(2), 1, Stance::Accepts);
+    vote(&mut tuner, ms(3), 1, Stance::Accepts);
+    assert_eq!(stances(&mut tuner), [(1, Stance::Accepts)]);
+    assert_eq!(tuner.next_deadline(), Some(ms(21)));
+    tuner.expire(ms(21), |_, _| {});
+    assert_eq!(stances(&mut tuner), [1, 2, 4].map(|to| (to, Stance::Accepts)));
+    // In the second half of the lead it asks for the result.
+    tuner.expire(ms(50), |_, _| {});
+    assert_eq!(stances(&mut tuner), [1, 2, 4].map(|to| (to, Stance::Doubts)));
 }
 
 #[test]
@@ -200,7 +219,6 @@ fn outsiders_change_nothing() {
     let steps = steps();
     let mut tuner = Tuner::new(steps.clone(), ms(0));
     prepare(&mut tuner, &transaction(2), ms(1)).expect("it is legal");
-    assert_eq!(stances(&mut tuner).len(), 1);
     for stance in [Stance::Accepts, Stance::Commits, Stance::Doubts, Stance::Refuses] {
         vote(&mut tuner, ms(2), 7, stance);
         vote(&mut tuner, ms(2), 1, stance);

@@ -1,9 +1,11 @@
 //! Roles: operators may set parameters, observers may read them.
 
 use sinew_runtime::{
-    parameters::{AskParameters, ParameterVote, SetParameters},
+    parameters::{
+        AskParameters, ParameterTransaction, ParameterVote, Participant, SetParameters, TransactionId,
+    },
     router::guard::Guard as _,
-    wire::Payload,
+    wire::{Message, Payload},
 };
 
 use super::*;
@@ -69,18 +71,33 @@ fn reply_sets_no_parameters_without_the_role() {
 }
 
 #[test]
-fn participants_of_a_transaction_agree_without_a_rule() {
+fn participants_that_an_operator_names_need_no_rule() {
     let place = place();
-    let access = place.access("");
-    let target = AppAddress::new(0x1001);
-    let vote = |source, destination| Header::new(ParameterVote::KIND, source, Tid::new(HERE, destination));
-    assert!(access.allows(&vote(app(THERE, 0x1005), target), target));
-    // Not to many, and not from a guest.
-    let group = Tid::group("drives").app;
-    assert!(!access.allows(&vote(app(THERE, 0x1005), group), target));
-    let guest = AppAddress::new(0x1006);
-    access.add_guest(guest, rustix::process::geteuid().as_raw() + 7);
-    assert!(!access.allows(&vote(Tid::new(HERE, guest), target), target));
+    let access = place.access("[[rule]]\nfrom = ['*']\nto = ['*']\n[roles]\noperators = ['here']\n");
+    let (knee, other) = (Tid::new(HERE, AppAddress::new(0x1001)), Tid::new(HERE, AppAddress::new(0x1002)));
+    let guest = Tid::new(HERE, AppAddress::new(0x1006));
+    access.add_guest(guest.app, rustix::process::geteuid().as_raw() + 7);
+    let hip = app(THERE, 0x1005);
+    let vote = |source, to: Tid| {
+        access.allows(
+            &Header::new(ParameterVote::KIND, source, to),
+            if to.app.is_group() { knee.app } else { to.app },
+        )
+    };
+    // Before the begin, and between others, not even a rule allows it.
+    assert!(!vote(hip, knee));
+    let named = |tid: Tid| Participant { tid: tid.bits(), app: String::new() };
+    let transaction = ParameterTransaction {
+        id: TransactionId { coordinator: other.bits(), began_ns: 1 },
+        participants: [knee, hip, guest].map(named).to_vec(),
+        values: Vec::new(),
+        lead_ns: 1,
+        applies_after_ns: 1,
+    };
+    access.sets(&Message::typed(other, knee, &SetParameters::Prepare(transaction)));
+    assert!(vote(hip, knee) && vote(knee, knee));
+    assert!(!vote(hip, other) && !vote(app(THERE, 0x1007), knee));
+    assert!(!vote(guest, knee) && !vote(hip, Tid::group("drives")));
 }
 
 #[test]
