@@ -159,6 +159,46 @@ fn applications_of_two_nodes_are_set_together() {
 }
 
 #[test]
+fn application_in_its_own_process_takes_part_in_a_transaction() {
+    let scenario = Scenario::new();
+    let mut knee = scenario.start("knee", 2, &["--tuned", "--tuned-apart"]);
+    knee.wait_for(&["started"]);
+    let has_both = |json: &Value| json["apps"].as_array().is_some_and(|apps| apps.len() == 2);
+    scenario.until("both are listed", "knee", &["param", "list"], has_both);
+    let set = |apart: &str| {
+        let apart = format!("knee.apart.assistance={apart}");
+        scenario.sinew("knee", &["param", "set", "knee.gains.assistance=0.5", &apart, "--json"])
+    };
+    let get = |name: &str| scenario.sinew("knee", &["param", "get", name]).out;
+    // When: the value of the one in its own process is illegal
+    let answer = set("1.4");
+    // Then
+    assert!(
+        answer.code == Some(1) && answer.out.contains("outside 0.0 to 1.0"),
+        "{}{}",
+        answer.out,
+        answer.err
+    );
+    assert_eq!(
+        (get("knee.gains.assistance"), get("knee.apart.assistance")),
+        ("0.3\n".into(), "0.3\n".into())
+    );
+    // When: both are legal
+    let answer = set("0.6");
+    // Then
+    assert!(
+        answer.code == Some(0) && answer.json()["verdict"] == json!("all"),
+        "{}{}",
+        answer.out,
+        answer.err
+    );
+    assert_eq!(
+        (get("knee.gains.assistance"), get("knee.apart.assistance")),
+        ("0.5\n".into(), "0.6\n".into())
+    );
+}
+
+#[test]
 fn set_from_another_node_is_refused() {
     // Given: the same, with sockets in two folders
     let scenario = Scenario::new();
