@@ -178,8 +178,8 @@ impl<A: Actor<Context = Self>> AppContext<A> {
             if let Some(id) = tuner.take_late() {
                 log::warn!(
                     application = %self.sender.tid(),
-                    "a transaction of {} was applied late, as this application was cut off when the others agreed on it; \
-                     `sinew param list` shows the values",
+                    "a transaction of {} was applied late, as this application learned late that all had accepted it: look \
+                     whether it was cut off or paused (`sinew nodes`, `sinew apps`)",
                     Tid::from_bits(id.coordinator)
                 );
             }

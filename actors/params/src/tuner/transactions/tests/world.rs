@@ -17,8 +17,6 @@ const WITHIN: Duration = ms(3_000);
 const DELAY_MAX_US: u64 = 3_000;
 /// When the transaction begins.
 const BEGIN: Duration = ms(100);
-/// When the run ends: all doubts and repairs have ended.
-const END: Duration = ms(12_000);
 /// The coordinator, as a sender and receiver.
 const COORDINATOR: usize = 99;
 
@@ -31,6 +29,17 @@ pub(super) enum Plan {
     Kills,
     /// A node is cut off. One run in three kills the coordinator.
     Cut,
+}
+
+impl Plan {
+    /// Returns when the run ends: all repairs have ended, and the cut has for a second.
+    const fn end(self) -> Duration {
+        match self {
+            Self::Calm => ms(1_000),
+            Self::Kills => ms(4_000),
+            Self::Cut => ms(6_500),
+        }
+    }
 }
 
 /// The generator SplitMix64.
@@ -108,7 +117,7 @@ impl World {
         let mut world = Self::new(seed);
         world.plan_faults(plan);
         while let Some(((at, _), event)) = world.events.pop_first() {
-            if at > END {
+            if at > plan.end() {
                 break;
             }
             world.now = at;
