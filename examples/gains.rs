@@ -61,6 +61,7 @@ impl Actor for Therapist {
 fn in_words(outcome: &ParameterOutcome) -> String {
     match outcome {
         ParameterOutcome::Applied { tick, .. } => format!("applied at tick {tick}"),
+        ParameterOutcome::Held { .. } => "held for a transaction".to_owned(),
         ParameterOutcome::Refused { why } => format!("refused: {why}"),
     }
 }

@@ -190,10 +190,14 @@ pub mod schema {
 
 /// Parameters: values of an application that are tuned while it runs. [`params!`](crate::params!) declares them.
 pub mod parameters {
+    pub use sinew_client::SetTogetherError;
     pub use sinew_params::{
-        AskParameters, Cell, Descriptor, Domain, NAME_BYTES_MAX, NamedValue, PARAMETERS_MAX, Param,
-        ParamType, ParameterError, ParameterList, ParameterOutcome, ParameterReport, Parameters, STAGED_MAX,
-        SetParameters, TICK_WITHIN, UNDO_MAX, Value, ValueError, check, file,
+        AskParameters, Cell, Coordinator, DOUBT_WITHIN, Descriptor, Domain, LEAD, LEAD_MAX, LEAD_MIN,
+        NAME_BYTES_MAX, NamedValue, PARAMETERS_MAX, PARTICIPANTS_MAX, Param, ParamType, ParameterError,
+        ParameterList, ParameterOutcome, ParameterReport, ParameterTransaction, ParameterVote, Parameters,
+        PartOutcome, PartReport, Participant, STAGED_MAX, SetParameters, Stance, Step, TICK_WITHIN,
+        TransactionError, TransactionId, TransactionReport, TransactionVerdict, UNDO_MAX, Value, ValueError,
+        check, file,
     };
 }
 

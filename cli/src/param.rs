@@ -3,6 +3,7 @@
 mod assignment;
 mod file;
 mod list;
+mod together;
 
 use std::path::PathBuf;
 
@@ -42,13 +43,18 @@ pub(crate) enum Order {
         #[arg(value_name = "APP.NAME")]
         parameter: ParameterName,
     },
-    /// Sets parameters of an application: all of these values, at one tick of its loop, or none
+    /// Sets parameters: all of these values, at one tick of the application's loop, or none
     ///
     /// The command prints the tick, or the reason of the refusal. A value that is declared with a slope begins to move
     /// at that tick.
+    ///
+    /// Values of several applications are one transaction: each applies its values at its first tick at or after one
+    /// stated time, half a second later, or none does. The exit code is 1 if they did not all do so, and the command
+    /// names each.
     #[command(after_help = r#"Examples:
   sinew param set knee.drive.assistance=0.5
-  sinew param set knee.drive.assistance=0.5 knee.drive.damped=true"#)]
+  sinew param set knee.drive.assistance=0.5 knee.drive.damped=true
+  sinew param set knee.drive.assistance=0.2 hip.drive.assistance=0.2"#)]
     Set {
         /// The application, the parameter and its value
         #[arg(value_name = "APP.NAME=VALUE", required = true)]
@@ -75,8 +81,8 @@ pub(crate) enum Order {
     },
     /// Sets the values of a file that `save` has written
     ///
-    /// The values of one application are one set. Each application is set by itself: if one refuses, others may have
-    /// been set, and the command names them.
+    /// The values of one application are one set, and those of up to 16 applications are one transaction, as for `set`:
+    /// all are set, or none is. Of more applications each 16 are one.
     #[command(after_help = r#"Examples:
   sinew param load walk.toml"#)]
     Load {
@@ -90,13 +96,20 @@ pub(crate) fn show(system: &mut System, order: &Order, is_wide: bool) -> Result<
     match order {
         Order::List { app } => list::show(system, app.as_deref(), is_wide),
         Order::Get { parameter } => get(system, parameter),
-        Order::Set { values } => {
-            let (app, values) = assignment::one_set(values)?;
-            Ok(SetResult::of(system, app, &SetParameters::Values(values))?.report())
-        }
+        Order::Set { values } => set_all(system, assignment::sets(values)),
         Order::Undo { app } => Ok(SetResult::of(system, app, &SetParameters::Undo)?.report()),
         Order::Save { file, apps } => file::save(system, file, apps),
         Order::Load { file } => file::load(system, file),
+    }
+}
+
+/// Sets parameters: of one application as a set, of several as a transaction.
+fn set_all(system: &mut System, mut sets: Vec<(String, Vec<NamedValue>)>) -> Result<Report, SystemError> {
+    match sets.pop() {
+        Some((app, values)) if sets.is_empty() => {
+            Ok(SetResult::of(system, &app, &SetParameters::Values(values))?.report())
+        }
+        last => together::set(system, sets.into_iter().chain(last).collect()),
     }
 }
 
@@ -114,6 +127,9 @@ fn get(system: &mut System, parameter: &ParameterName) -> Result<Report, SystemE
     // Alone, for a pipe.
     Ok(Report { text: format!("{}\n", found.value), json: list::parameter_json(found), is_fine: true })
 }
+
+/// The fault of an answer that belongs to no set of one application.
+const HELD: &str = "it answered with a state of a transaction: it has another version of Sinew; update both";
 
 /// The result of a set of parameters of one application.
 struct SetResult {
@@ -135,6 +151,7 @@ impl SetResult {
         match &self.outcome {
             Ok(ParameterOutcome::Applied { .. }) => None,
             Ok(ParameterOutcome::Refused { why }) | Err(why) => Some(why),
+            Ok(ParameterOutcome::Held { .. }) => Some(HELD),
         }
     }
 
@@ -143,6 +160,7 @@ impl SetResult {
         let (tick, at_ns, values) = match &self.outcome {
             Ok(ParameterOutcome::Applied { tick, at_ns, values }) => (tick, at_ns, values),
             Ok(ParameterOutcome::Refused { why }) => return format!("{app}: refused: {}\n", clean(why)),
+            Ok(ParameterOutcome::Held { .. }) => return format!("{app}: {HELD}\n"),
             Err(why) => return format!("{app}: {}\n", clean(why)),
         };
         let values: Vec<_> =
@@ -158,7 +176,9 @@ impl SetResult {
     fn json(&self) -> Json {
         let (tick, at_ns, values) = match &self.outcome {
             Ok(ParameterOutcome::Applied { tick, at_ns, values }) => (Some(tick), Some(at_ns), &values[..]),
-            Ok(ParameterOutcome::Refused { .. }) | Err(_) => (None, None, &[][..]),
+            Ok(ParameterOutcome::Refused { .. } | ParameterOutcome::Held { .. }) | Err(_) => {
+                (None, None, &[][..])
+            }
         };
         let values = values.iter().map(|one| json!({ "name": one.name, "value": value_json(one.value) }));
         json!({

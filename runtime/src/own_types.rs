@@ -1,6 +1,6 @@
 //! The payload types of the runtime itself.
 
-use sinew_params::{AskParameters, ParameterList, ParameterOutcome, SetParameters};
+use sinew_params::{AskParameters, ParameterList, ParameterOutcome, ParameterVote, SetParameters};
 
 use crate::{protection::Echo, wire::remember};
 
@@ -11,6 +11,7 @@ pub fn remember_own_types() {
     let _ = remember::<Echo>();
     let _ = (remember::<AskParameters>(), remember::<ParameterList>());
     let _ = (remember::<SetParameters>(), remember::<ParameterOutcome>());
+    let _ = remember::<ParameterVote>();
 }
 
 #[cfg(test)]
@@ -21,7 +22,7 @@ mod tests {
     #[test]
     fn own_types_have_names_and_structures() {
         remember_own_types();
-        for name in ["sinew.echo", "sinew.param.set", "sinew.param.outcome"] {
+        for name in ["sinew.echo", "sinew.param.set", "sinew.param.outcome", "sinew.param.vote"] {
             let kind = Kind::named(name);
             assert_eq!(kind.type_name(), Some(name));
             assert!(kind.schema().is_some_and(|schema| schema.is_ok()), "{name}");

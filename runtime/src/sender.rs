@@ -10,6 +10,7 @@ mod reply;
 mod room;
 mod sent_types;
 mod stop;
+mod transaction;
 mod unknown_name;
 
 use std::{

@@ -8,6 +8,7 @@ pub mod contracts;
 pub mod link_faults;
 pub mod load;
 pub mod orders;
+pub mod params;
 pub mod recording;
 pub mod roles;
 pub mod slow_consumer;

@@ -6,7 +6,7 @@ mod unread_log;
 
 use std::process::ExitCode;
 
-use crate::{attacks, barriers, clients, contracts, link_faults, recording, slow_consumer, stops};
+use crate::{attacks, barriers, clients, contracts, link_faults, params, recording, slow_consumer, stops};
 
 /// The options of a role, after its configuration.
 struct Options<'a>(&'a [String]);
@@ -45,6 +45,7 @@ pub fn run() -> Option<ExitCode> {
         "link-node" => link_faults::run_node(arguments),
         "contract-node" => contracts::run_node(arguments),
         "recorded" => recording::run_node(arguments),
+        "param-node" => params::run_node(arguments),
         "stop-node" => stops::run_node(arguments),
         "sender" => slow_consumer::run_sender(arguments),
         "receiver" => slow_consumer::run_receiver(arguments),

@@ -287,6 +287,8 @@ fn sentence(order: &SetParameters, outcome: &Result<ParameterOutcome, String>) -
     let order = match order {
         SetParameters::Undo => "undo of the last set".to_owned(),
         SetParameters::Values(values) => list(values),
+        // The page sends neither.
+        SetParameters::Prepare(_) | SetParameters::Conclude(_) => "transaction".to_owned(),
     };
     match outcome {
         Ok(ParameterOutcome::Applied { tick, values, .. }) => {
@@ -294,6 +296,7 @@ fn sentence(order: &SetParameters, outcome: &Result<ParameterOutcome, String>) -
                 if *tick == 0 { "between two messages".to_owned() } else { format!("at tick {tick}") };
             format!("{order}: applied {place}: {}", list(values))
         }
+        Ok(ParameterOutcome::Held { .. }) => format!("{order}: held"),
         Ok(ParameterOutcome::Refused { why }) => format!("{order}: refused: {why}"),
         Err(why) => format!("{order}: {why}"),
     }

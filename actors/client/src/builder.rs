@@ -45,9 +45,9 @@ pub struct MessageBuilder<'a, E, C> {
 /// The settings of one call that override those of its type and its endpoint.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct SendTerms {
-    room_within: Option<Duration>,
-    expires_after: Option<Duration>,
-    class: Option<Class>,
+    pub(super) room_within: Option<Duration>,
+    pub(super) expires_after: Option<Duration>,
+    pub(super) class: Option<Class>,
 }
 
 /// A value and its destination.

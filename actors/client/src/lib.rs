@@ -183,6 +183,7 @@ mod node_api;
 mod node_link;
 mod only_message;
 mod outgoing;
+mod parameters;
 mod protected;
 mod reactor;
 mod received;
@@ -196,6 +197,7 @@ mod stall_timeout;
 mod stop;
 #[cfg(test)]
 mod tests;
+mod transaction;
 mod undelivered;
 mod wait_mode;
 
@@ -208,6 +210,8 @@ pub use error::ApiError;
 pub use link::Transport;
 pub use loan::LoanedMessage;
 pub use node_api::NodeApi;
+pub use parameters::EndpointParameters;
 pub use received::Received;
 pub use registration::Registration;
 pub use sinew_shm::Spin;
+pub use transaction::SetTogetherError;

@@ -175,6 +175,11 @@ impl Received {
         self.message.settle(outcome);
     }
 
+    /// Returns when the sender stops waiting, in this host's clock; [`Time::MAX`] if it never does.
+    pub(super) fn expiry(&self) -> Time {
+        self.message.header.expiry()
+    }
+
     pub(super) const fn correlation(&self) -> u64 {
         self.message.header.correlation
     }

@@ -74,6 +74,7 @@ macro_rules! on_every_transport {
 
 mod awaiting;
 mod loans;
+mod parameters;
 mod protected;
 mod reconnect;
 mod registration;

@@ -15,6 +15,66 @@ pub enum SetParameters {
     Values(Vec<NamedValue>),
     /// The parameters of the last set that was applied and not undone get their former values.
     Undo,
+    /// The application takes part in a transaction: it holds its values until the stated time. The reply is
+    /// [`ParameterOutcome::Held`], or a refusal.
+    Prepare(ParameterTransaction),
+    /// Asks for the outcome of a transaction in which the application took part. Changes nothing.
+    Conclude(TransactionId),
+}
+
+/// The part of one application in a transaction over several ones.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct ParameterTransaction {
+    /// The transaction.
+    pub id: TransactionId,
+    /// All applications of the transaction, with the receiver of this message.
+    pub participants: Vec<Participant>,
+    /// The values of the receiver.
+    pub values: Vec<NamedValue>,
+    /// Time from the begin of the transaction to the stated time, in nanoseconds. Acceptances count in its first half.
+    pub lead_ns: u64,
+    /// Time from the sending of this message to the stated time, in nanoseconds.
+    pub applies_after_ns: u64,
+}
+
+/// The identity of a transaction.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+pub struct TransactionId {
+    /// The bits of the TID of its coordinator.
+    pub coordinator: u64,
+    /// When it began, in nanoseconds of the coordinator's clock.
+    pub began_ns: u64,
+}
+
+/// An application in a transaction.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Participant {
+    /// The bits of its TID.
+    pub tid: u64,
+    /// Its name, for texts.
+    pub app: String,
+}
+
+/// A message from one participant of a transaction to another one.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ParameterVote {
+    /// The transaction.
+    pub transaction: TransactionId,
+    /// The knowledge of the sender.
+    pub stance: Stance,
+}
+
+/// The knowledge of a participant about a transaction.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub enum Stance {
+    /// It holds legal values, and counts acceptances still.
+    Accepts,
+    /// Acceptances do not count any more, and it does not know whether the transaction is agreed on.
+    Doubts,
+    /// All have accepted: the values apply at the stated time.
+    Commits,
+    /// It applies nothing: it has refused, given up, or does not know the transaction.
+    Refuses,
 }
 
 /// A parameter's name and a value.
@@ -39,7 +99,18 @@ pub enum ParameterOutcome {
         /// The values. A parameter with a slope begins to move to its value.
         values: Vec<NamedValue>,
     },
-    /// No value was applied, and none will be.
+    /// The values of a transaction are legal, and are held until the stated time.
+    Held {
+        /// The stated time, in nanoseconds of the application's clock.
+        stated_ns: u64,
+        /// Maximum error of the stated time, by the measured offset of the clocks; 0 on the coordinator's host.
+        bound_ns: u64,
+        /// Whether all participants have accepted: the values apply at the first tick at or after the stated time.
+        is_agreed: bool,
+    },
+    /// No value was applied. None will be, except in a transaction as [`ParameterError::NotAgreed`] says.
+    ///
+    /// [`ParameterError::NotAgreed`]: crate::ParameterError::NotAgreed
     Refused {
         /// The reason: the parameter, the value and its range.
         why: String,

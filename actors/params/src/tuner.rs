@@ -1,7 +1,8 @@
-//! Stages sets of values, applies them at a tick, moves values with their slopes.
+//! Stages sets of values, applies them at a tick, moves values with their slopes, takes part in transactions.
 
 #[cfg(test)]
 mod tests;
+mod transactions;
 
 use std::{
     collections::{BTreeSet, VecDeque},
@@ -9,9 +10,10 @@ use std::{
     time::Duration,
 };
 
+use self::transactions::Transactions;
 use crate::{
-    Domain, NamedValue, ParameterList, ParameterOutcome, ParameterReport, Parameters, SetParameters, Value,
-    descriptor::Descriptor,
+    Domain, NamedValue, PARTICIPANTS_MAX, ParameterList, ParameterOutcome, ParameterReport, Parameters,
+    SetParameters, Value, descriptor::Descriptor,
 };
 
 /// Maximum number of sets that wait for a tick. Further ones are refused.
@@ -85,6 +87,38 @@ pub enum ParameterError {
         "{0} moves with a slope at ticks, and the application has no periodic timer: start one by `ctx.every`, or declare it without a slope"
     )]
     SlopeWithoutTicks(&'static str),
+    /// A transaction holds the parameters until its stated time. The caller sends too often.
+    #[error("a transaction holds the parameters until its stated time: send this set again after it")]
+    Held,
+    /// A transaction names this application not at all or twice, or too many ones. The caller is at fault.
+    #[error(
+        "a transaction names 1 to {PARTICIPANTS_MAX} applications, each once, and the receiver among them"
+    )]
+    Participants,
+    /// The clock of the sender's host is not measured yet, so that the stated time is not known here.
+    #[error(
+        "the clock of the sender's host is not measured yet, so that the stated time is not known here: send the transaction again in some seconds"
+    )]
+    UnknownClock,
+    /// The lead of a transaction is outside of its range. The caller is at fault.
+    #[error("the stated time of a transaction is 20 ms to 2 s after its begin")]
+    Lead,
+    /// A transaction arrived when acceptances did not count any more.
+    #[error(
+        "it arrived after half of its lead, when acceptances do not count any more: give it a longer lead"
+    )]
+    TooLate,
+    /// Not all participants have accepted a transaction in time, as far as is known here.
+    #[error(
+        "nothing was applied at the stated time, as no acceptance of {missing} was known. If another application has applied its values, these ones follow as soon as it can be reached within 10 s, if no other set comes before"
+    )]
+    NotAgreed {
+        /// The names of the others.
+        missing: String,
+    },
+    /// The application has not taken part in this transaction since its start.
+    #[error("the application knows no such transaction: it was started after it, or has had 16 others since")]
+    UnknownTransaction,
 }
 
 /// The values of a set, by the index of the parameter.
@@ -111,6 +145,7 @@ pub struct Tuner<T> {
     is_moving: bool,
     /// Whether this tick has changed a kept parameter.
     has_kept_change: bool,
+    transactions: Transactions,
 }
 
 impl<T> Tuner<T> {
@@ -130,6 +165,7 @@ impl<T> Tuner<T> {
             moved: now,
             is_moving: true,
             has_kept_change: false,
+            transactions: Transactions::default(),
         };
         // A kept value of the former incarnation may have been on its way.
         tuner.advance(Duration::ZERO);
@@ -149,7 +185,14 @@ impl<T> Tuner<T> {
         if self.staged.len() >= STAGED_MAX {
             return Err((ticket, ParameterError::Full));
         }
+        if self.transactions.holds() {
+            return Err((ticket, ParameterError::Held));
+        }
         let values = match set {
+            // These are no sets to stage: see `prepare` and `outcome_of`.
+            SetParameters::Prepare(_) | SetParameters::Conclude(_) => {
+                return Err((ticket, ParameterError::Participants));
+            }
             SetParameters::Undo => None,
             SetParameters::Values(values) => match self.check(values, has_ticks) {
                 Ok(values) => Some(values),
@@ -162,6 +205,7 @@ impl<T> Tuner<T> {
         {
             return Err((ticket, ParameterError::SlopeWithoutTicks(name)));
         }
+        self.transactions.supersede();
         self.staged.push_back(Staged { ticket, values, until });
         Ok(())
     }
@@ -186,14 +230,16 @@ impl<T> Tuner<T> {
             };
             done(ticket, outcome);
         }
+        self.apply_transaction(tick, now);
         if self.is_moving {
             self.advance(since);
         }
         self.has_kept_change
     }
 
-    /// Refuses the sets that have waited too long.
+    /// Refuses the sets that have waited too long, and takes the steps of a transaction that are due.
     pub fn expire(&mut self, now: Duration, mut done: impl FnMut(T, ParameterOutcome)) {
+        self.advance_transaction(now);
         // In the order of arrival; deadlines differ, as each sender has its own.
         for _ in 0..self.staged.len() {
             match self.staged.pop_front() {
@@ -209,16 +255,16 @@ impl<T> Tuner<T> {
         self.moved = now;
     }
 
-    /// Returns the earliest time at which a set that waits is refused.
+    /// Returns the earliest time at which a set that waits is refused, or a transaction has a step to take.
     #[must_use]
     pub fn next_deadline(&self) -> Option<Duration> {
-        self.staged.iter().map(|staged| staged.until).min()
+        self.staged.iter().map(|staged| staged.until).chain(self.transactions.next_wake()).min()
     }
 
-    /// Returns whether no set waits and no value moves.
+    /// Returns whether no set waits, no value moves and no transaction is open.
     #[must_use]
     pub fn is_idle(&self) -> bool {
-        self.staged.is_empty() && !self.is_moving
+        self.staged.is_empty() && !self.is_moving && self.transactions.is_idle()
     }
 
     /// Returns all parameters and their values.

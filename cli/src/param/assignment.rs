@@ -4,8 +4,6 @@ use std::str::FromStr;
 
 use sinew::parameters::{NamedValue, Value};
 
-use crate::{system::SystemError, table::clean};
-
 /// A parameter of an application. The last dot separates them, since names of applications may have dots.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct ParameterName {
@@ -45,20 +43,17 @@ impl FromStr for Assignment {
     }
 }
 
-/// Returns the one application of these assignments, and its set of values.
-///
-/// # Errors
-/// They are about several applications.
-pub(super) fn one_set(assignments: &[Assignment]) -> Result<(&str, Vec<NamedValue>), SystemError> {
-    let first = assignments.first().map_or("", |first| first.parameter.app.as_str());
-    if let Some(other) = assignments.iter().find(|one| one.parameter.app != first) {
-        let (first, other) = (clean(first), clean(&other.parameter.app));
-        return Err(SystemError::Usage(format!(
-            "{first} and {other} are two applications, and a set is applied at a tick of one: set each by itself"
-        )));
+/// Returns the set of each application of these assignments, in the order in which the applications come first.
+pub(super) fn sets(assignments: &[Assignment]) -> Vec<(String, Vec<NamedValue>)> {
+    let mut sets: Vec<(String, Vec<NamedValue>)> = Vec::new();
+    for Assignment { parameter, value } in assignments {
+        let value = NamedValue { name: parameter.name.clone(), value: *value };
+        match sets.iter_mut().find(|(app, _)| *app == parameter.app) {
+            Some((_, values)) => values.push(value),
+            None => sets.push((parameter.app.clone(), vec![value])),
+        }
     }
-    let value = |one: &Assignment| NamedValue { name: one.parameter.name.clone(), value: one.value };
-    Ok((first, assignments.iter().map(value).collect()))
+    sets
 }
 
 #[cfg(test)]
@@ -83,12 +78,13 @@ mod tests {
     }
 
     #[test]
-    fn values_of_two_applications_are_no_set() {
-        let words: Vec<Assignment> =
-            ["hip.gain=1", "knee.gain=1"].map(|text| text.parse().expect("it is legal")).to_vec();
-        let why = one_set(&words).expect_err("there are two").to_string();
-        assert!(why.contains("hip and knee are two applications"), "{why}");
-        let (app, values) = one_set(&words[..1]).expect("there is one");
-        assert_eq!((app, values.len()), ("hip", 1));
+    fn values_are_grouped_by_application() {
+        let words: Vec<Assignment> = ["hip.gain=1", "knee.gain=2", "hip.damped=true"]
+            .map(|text| text.parse().expect("it is legal"))
+            .to_vec();
+        let value = |name: &str, value| NamedValue { name: name.to_owned(), value };
+        let hip = vec![value("gain", Value::Integer(1)), value("damped", Value::Flag(true))];
+        let knee = vec![value("gain", Value::Integer(2))];
+        assert_eq!(sets(&words), [("hip".to_owned(), hip), ("knee".to_owned(), knee)]);
     }
 }

@@ -8,11 +8,11 @@ use std::{
 
 use serde_json::json;
 use sinew::parameters::{
-    SetParameters,
+    PARTICIPANTS_MAX,
     file::{self, FILE_BYTES_MAX, ValuesOfApps},
 };
 
-use super::{SetResult, list, targets};
+use super::{list, targets};
 use crate::{
     Report,
     system::{System, SystemError},
@@ -63,21 +63,18 @@ pub(super) fn save(system: &mut System, path: &Path, apps: &[String]) -> Result<
     })
 }
 
-/// Sets the values of a file: one set for each application.
+/// Sets the values of a file: those of several applications as one transaction, if there are not too many.
 pub(super) fn load(system: &mut System, path: &Path) -> Result<Report, SystemError> {
     let sets = read(path)?;
-    // Each is found before the first one is set.
-    for app in sets.keys() {
-        system.find(app)?;
+    let sets: Vec<_> = sets.into_iter().collect();
+    let (mut text, mut reports, mut is_fine) = (String::new(), Vec::new(), true);
+    for sets in sets.chunks(PARTICIPANTS_MAX) {
+        let report = super::set_all(system, sets.to_vec())?;
+        text += &report.text;
+        is_fine &= report.is_fine;
+        reports.push(report.json);
     }
-    let (mut text, mut results, mut is_fine) = (String::new(), Vec::new(), true);
-    for (app, values) in sets {
-        let result = SetResult::of(system, &app, &SetParameters::Values(values))?;
-        text += &result.text();
-        is_fine &= result.fault().is_none();
-        results.push(result.json());
-    }
-    Ok(Report { text, json: json!({ "apps": results }), is_fine })
+    Ok(Report { text, json: json!({ "sets": reports }), is_fine })
 }
 
 /// Replaces the file by one with this text: readers see the former one or the new one, never a part.

@@ -59,7 +59,7 @@ fn refused_set_is_a_finding_and_changes_nothing() {
         (&["knee.gains.assistence=0.4"], 1, "the nearest name is 'assistance'"),
         (&["knee.assistance=0.4"], 1, "knee has no parameters"),
         (&["knee.gain.assistance=0.4"], 1, "nearest: knee.gains"),
-        (&["knee.gains.assistance=0.4", "hip.gains.assistance=0.4"], 2, "two applications"),
+        (&["knee.gains.assistance=0.4", "hip.gains.assistance=0.4"], 1, "hip.gains"),
         (&["assistance=0.4"], 2, "as in knee.drive.assistance"),
     ] {
         let answer = scenario.sinew("knee", &[&["param", "set"], words].concat());
@@ -112,6 +112,90 @@ fn set_from_another_node_uses_the_application_socket() {
     // Then
     assert_eq!(answer.code, Some(0), "{}{}", answer.out, answer.err);
     knee.wait_for(&["assistance 0.5 at tick "]);
+}
+
+#[test]
+fn applications_of_two_nodes_are_set_together() {
+    // Given: two nodes, each with an application that has parameters
+    let scenario = Scenario::new();
+    let mut nodes = [scenario.start("hip", 1, &["--tuned"]), scenario.start("knee", 2, &["--tuned"])];
+    nodes.iter_mut().for_each(|node| drop(node.wait_for(&["started"])));
+    let has_both = |json: &Value| json["apps"].as_array().is_some_and(|apps| apps.len() == 2);
+    let json = scenario.until("both are listed", "hip", &["param", "list"], has_both);
+    let mut tids: Vec<String> = Vec::new();
+    for app in json["apps"].as_array().expect("it is a list") {
+        tids.push(app["tid"].as_str().expect("it is a text").to_owned());
+    }
+    let set = |values: [&str; 2]| {
+        let words: Vec<_> =
+            tids.iter().zip(values).map(|(tid, value)| format!("{tid}.assistance={value}")).collect();
+        scenario.sinew("hip", &["param", "set", &words[0], &words[1], "--json"])
+    };
+    // When: the value of one is illegal
+    let answer = set(["0.5", "1.4"]);
+    // Then: none is set
+    assert!(
+        answer.code == Some(1) && answer.json()["verdict"] == json!("none"),
+        "{}{}",
+        answer.out,
+        answer.err
+    );
+    assert!(answer.out.contains("outside 0.0 to 1.0"), "{}", answer.out);
+    // When: both are legal
+    let answer = set(["0.5", "0.6"]);
+    // Then: both loops have seen theirs
+    assert!(
+        answer.code == Some(0) && answer.json()["verdict"] == json!("all"),
+        "{}{}",
+        answer.out,
+        answer.err
+    );
+    for (app, value) in answer.json()["apps"].as_array().expect("it is a list").iter().zip(["0.5", "0.6"]) {
+        assert!(app["at_ns"].as_u64() >= app["stated_ns"].as_u64(), "{app}");
+        let seen = format!("assistance {value} at tick {}", app["tick"]);
+        let is_hip = app["app"].as_str().is_some_and(|tid| tid.starts_with("127.0.0.1"));
+        nodes[usize::from(!is_hip)].wait_for(&[&seen]);
+    }
+}
+
+#[test]
+fn application_in_its_own_process_takes_part_in_a_transaction() {
+    let scenario = Scenario::new();
+    let mut knee = scenario.start("knee", 2, &["--tuned", "--tuned-apart"]);
+    knee.wait_for(&["started"]);
+    let has_both = |json: &Value| json["apps"].as_array().is_some_and(|apps| apps.len() == 2);
+    scenario.until("both are listed", "knee", &["param", "list"], has_both);
+    let set = |apart: &str| {
+        let apart = format!("knee.apart.assistance={apart}");
+        scenario.sinew("knee", &["param", "set", "knee.gains.assistance=0.5", &apart, "--json"])
+    };
+    let get = |name: &str| scenario.sinew("knee", &["param", "get", name]).out;
+    // When: the value of the one in its own process is illegal
+    let answer = set("1.4");
+    // Then
+    assert!(
+        answer.code == Some(1) && answer.out.contains("outside 0.0 to 1.0"),
+        "{}{}",
+        answer.out,
+        answer.err
+    );
+    assert_eq!(
+        (get("knee.gains.assistance"), get("knee.apart.assistance")),
+        ("0.3\n".into(), "0.3\n".into())
+    );
+    // When: both are legal
+    let answer = set("0.6");
+    // Then
+    assert!(
+        answer.code == Some(0) && answer.json()["verdict"] == json!("all"),
+        "{}{}",
+        answer.out,
+        answer.err
+    );
+    assert_eq!(
+        (get("knee.gains.assistance"), get("knee.apart.assistance")),
+        ("0.5\n".into(), "0.6\n".into())
+    );
 }
 
 #[test]

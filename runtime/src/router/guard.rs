@@ -31,6 +31,10 @@ pub trait Guard: Send + Sync {
     /// Reports that an application of this node sends a request to one application; called before the request
     /// can be answered.
     fn asks(&self, header: &Header);
+
+    /// Reports that a set of parameters may reach its application of this node: it may name the participants of a
+    /// transaction, which send each other messages.
+    fn sets(&self, _set: &Message) {}
 }
 
 /// The senders that may set parameters of this node's applications, in addition to a [`Guard`].
@@ -125,7 +129,14 @@ impl Judge<'_> {
     #[inline]
     pub(super) fn check(self, message: &mut Message) -> Option<Rejection> {
         match self.of(message.header.destination.app, &message.header) {
-            Verdict::Allowed => None,
+            Verdict::Allowed => {
+                if let Some(guard) = self.guard
+                    && message.header.kind == SetParameters::KIND
+                {
+                    guard.sets(message);
+                }
+                None
+            }
             Verdict::Refused(why) => Some(why),
             Verdict::Spoiled => {
                 message.payload = Bytes::from_static(SPOILED);

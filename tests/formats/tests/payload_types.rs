@@ -18,7 +18,7 @@ use sinew::{
         FreezeReport, FrozenReport, LogsReport, MismatchesReport, NodeReport, Ping, ReachReport,
         RecordReport, ReloadReport, SchemasReport, TreeReport, WatchReport,
     },
-    parameters::{AskParameters, ParameterList, ParameterOutcome, SetParameters},
+    parameters::{AskParameters, ParameterList, ParameterOutcome, ParameterVote, SetParameters},
     schema::{Schema, schema_of},
     stop::{AcknowledgeStop, AskStop, PressStop, ReleaseStop, StopReport},
 };
@@ -107,7 +107,7 @@ fn every_payload_type_of_this_tree_is_traced() {
         MismatchesReport NodeReport Ping ReachReport RecordReport ReloadReport SchemasReport TreeReport WatchReport
         ArriveAtBarrier BarrierAnswer LeaveBarrier
         AskContracts ContractsReport
-        AskParameters ParameterList ParameterOutcome SetParameters
+        AskParameters ParameterList ParameterOutcome ParameterVote SetParameters
         AcknowledgeStop AskStop PressStop ReleaseStop StopReport
     };
     let mut names = BTreeSet::new();

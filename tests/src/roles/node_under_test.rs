@@ -4,7 +4,7 @@
 //! node_under_test CONFIG.toml [--requires NAME]... [--sends-to NAME] [--floods NAME]... [--will NAME]...
 //! [--meets NAME]... [--incarnation NUMBER] [--says-directory] [--streams-to NAME [--stream BYTES]...]
 //! [--stamps-to NAME] [--logs | --logs-info | --default-log] [--held] [--forgets-a-handler]
-//! [--sends-text-to NAME] [--panics] [--tuned]
+//! [--sends-text-to NAME] [--panics] [--tuned] [--tuned-apart]
 //! ```
 //!
 //! With `--held` a thread-local variable of the main thread holds the node, and `main` returns 3 once the
@@ -20,7 +20,8 @@
 //! Sinew's own lines go to standard error.
 //!
 //! With `--tuned` it runs another application, called like the node with `.gains` behind it, which has parameters and
-//! prints one of them when it changes.
+//! prints one of them when it changes. With `--tuned-apart` it runs one more, with `.apart` behind its name, in a process
+//! of its own.
 //!
 //! Some options cause mistakes. With `--forgets-a-handler` counts are not declared as handled. With
 //! `--sends-text-to` it sends a type with the name of a count but a text in its field, every 20 ms. With
@@ -309,10 +310,10 @@ pub(super) fn run(arguments: &[String]) -> ExitCode {
         builder = builder.app(AppSpec::new(app, make).requires([to]));
     }
     if has("--tuned") {
-        let gains = Gains::new();
-        let shared = gains.clone();
-        let make = move || Tuned { printed: shared.assistance.get(), gains: shared.clone() };
-        builder = builder.app(AppSpec::new(format!("{name}.gains"), make).params(&gains));
+        builder = builder.app(tuned(format!("{name}.gains")));
+    }
+    if has("--tuned-apart") {
+        builder = builder.app(tuned(format!("{name}.apart")).own_process());
     }
     for number in after("--incarnation") {
         let Ok(number) = number.parse() else {
@@ -324,6 +325,14 @@ pub(super) fn run(arguments: &[String]) -> ExitCode {
     // Used before all others, so that its destructor runs after theirs.
     HELD.with(|held| drop(held.borrow()));
     start(builder, has("--held"), has("--says-directory"))
+}
+
+/// An application with parameters.
+fn tuned(name: String) -> AppSpec<Tuned> {
+    let gains = Gains::new();
+    let shared = gains.clone();
+    let make = move || Tuned { printed: shared.assistance.get(), gains: shared.clone() };
+    AppSpec::new(name, make).params(&gains)
 }
 
 fn start(builder: NodeBuilder, is_held: bool, says_directory: bool) -> ExitCode {

@@ -88,7 +88,7 @@ fn tick(tuner: &mut Tuner<u32>, number: u64, now: Duration) -> Vec<(u32, Paramet
 fn why(outcome: &ParameterOutcome) -> &str {
     match outcome {
         ParameterOutcome::Refused { why } => why,
-        ParameterOutcome::Applied { .. } => panic!("{outcome:?}"),
+        ParameterOutcome::Applied { .. } | ParameterOutcome::Held { .. } => panic!("{outcome:?}"),
     }
 }
 
@@ -375,7 +375,7 @@ proptest! {
                     let outcomes = tick(&mut tuner, number, now);
                     let last = outcomes.iter().rev().find_map(|(_, outcome)| match outcome {
                         ParameterOutcome::Applied { values, tick, .. } => Some((values.clone(), *tick)),
-                        ParameterOutcome::Refused { .. } => None,
+                        ParameterOutcome::Refused { .. } | ParameterOutcome::Held { .. } => None,
                     });
                     for (ticket, _) in &outcomes {
                         prop_assert!(open.remove(ticket), "{ticket} has a second outcome");

@@ -1,4 +1,4 @@
-//! Parameters in virtual time: applied at a tick, refused in words, moved with a slope.
+//! Parameters in virtual time: applied at a tick, refused in words, moved with a slope, set together.
 
 use std::sync::Arc;
 
@@ -74,6 +74,7 @@ impl Actor for Tuner {
                         let at = Time::from_nanos(at_ns).since(START);
                         note(ctx, format!("tick {tick} after {at:?}"));
                     }
+                    ParameterOutcome::Held { stated_ns, .. } => note(ctx, format!("held until {stated_ns}")),
                     ParameterOutcome::Refused { why } => note(ctx, why),
                 }));
             });
@@ -185,4 +186,91 @@ fn parameters_are_listed_without_a_handler_of_the_application() {
     let reader = AppSpec::new("hip", || Reader);
     let outputs = replay().app(knee(&[TICK])).app(reader).ends_at(ms(2)).run([]).unwrap();
     assert_eq!(notes(&outputs), [(us(500), "newton_metres 3.0 Nm true".to_owned())]);
+}
+
+/// A loop that notes each new torque.
+struct Joint {
+    name: &'static str,
+    gains: Arc<Gains>,
+    last: f64,
+}
+
+impl Joint {
+    fn spec(name: &'static str, period: Duration) -> AppSpec<JointLoop> {
+        let gains = Gains::new();
+        let shared = gains.clone();
+        let joint = move || JointLoop { joint: Self { name, gains: shared.clone(), last: 3.0 }, period };
+        AppSpec::new(name, joint).params(&gains)
+    }
+}
+
+struct JointLoop {
+    joint: Joint,
+    period: Duration,
+}
+
+impl Actor for JointLoop {
+    type Context = AppContext<Self>;
+
+    fn started(&mut self, ctx: &mut Self::Context) {
+        ctx.every(self.period, |this, _, ctx| {
+            let Joint { name, gains, last } = &mut this.joint;
+            let newton_metres = gains.newton_metres.get();
+            if newton_metres != std::mem::replace(last, newton_metres) {
+                note(ctx, format!("{name} has {newton_metres:?}"));
+            }
+        });
+    }
+}
+
+/// Sets the torques of both joints as one transaction 3.5 ms after the start, and notes the report.
+struct Together {
+    torques: [f64; 2],
+}
+
+impl Actor for Together {
+    type Context = AppContext<Self>;
+
+    fn started(&mut self, ctx: &mut Self::Context) {
+        ctx.after(us(3_500), |this, _, ctx| {
+            let set = |app: &str, value: f64| {
+                let torque = NamedValue { name: "newton_metres".to_owned(), value: Value::Number(value) };
+                (app.to_owned(), vec![torque])
+            };
+            let sets = vec![set("knee", this.torques[0]), set("motor", this.torques[1])];
+            let report = ctx.sender().set_together(sets, TICK * 100, TICK * 1_000);
+            ctx.spawn(report.into_actor(this).map(|report, _, ctx| {
+                let report = report.unwrap();
+                note(ctx, format!("{:?}: {:?}", report.verdict, report.parts));
+            }));
+        });
+    }
+}
+
+fn together(torques: [f64; 2]) -> Vec<(Duration, String)> {
+    let replay = replay().app(Joint::spec("knee", TICK)).app(Joint::spec("motor", TICK * 2));
+    let together = AppSpec::new("hip", move || Together { torques });
+    notes(&replay.app(together).ends_at(ms(1_500)).run([]).unwrap())
+}
+
+#[test]
+fn transaction_applies_at_one_stated_time_in_both_loops() {
+    let notes = together([5.0, 6.0]);
+    // Stated for 103.5 ms: the first tick after that is at 104 ms in both loops.
+    for text in ["knee has 5.0", "motor has 6.0"] {
+        assert!(notes.contains(&(us(104_000), text.to_owned())), "{notes:?}");
+    }
+    let report = notes.iter().find(|(_, text)| text.starts_with("All: "));
+    assert!(
+        report.is_some_and(|(_, text)| text.contains("tick: 104") && text.contains("tick: 52")),
+        "{notes:?}"
+    );
+    assert_eq!(notes.len(), 3, "{notes:?}");
+}
+
+#[test]
+fn transaction_with_one_illegal_value_changes_nothing() {
+    let notes = together([5.0, 90.0]);
+    let [(_, report)] = &notes[..] else { panic!("{notes:?}") };
+    assert!(report.starts_with("None: ") && report.contains("90.0 Nm is outside 0.0 to 60.0 Nm"), "{report}");
 }

@@ -1,5 +1,6 @@
 //! The active access list as every sender reads it. It can be reloaded, and receives the names in the directory.
 
+mod participants;
 mod roles;
 
 use std::{
@@ -20,9 +21,10 @@ use sinew_runtime::{
     router::guard::Guard,
     tid::{AppAddress, Incarnation, NodeAddress, Tid},
     time::Time,
-    wire::{Flags, Header, Payload},
+    wire::{Flags, Header, Message, Payload},
 };
 
+use self::participants::Participants;
 use super::{
     client::{Applicant, ClientAccessError, Lines},
     file,
@@ -51,6 +53,8 @@ pub struct Access {
     memberships: Mutex<Memberships>,
     /// Pending requests of this node's applications: their replies need no rule.
     pending: PendingRequests,
+    /// The participants of transactions of parameters: their messages need no rule.
+    participants: Participants,
 }
 
 /// Maximum number of nodes with known names, in addition to those in the directory.
@@ -139,7 +143,8 @@ impl Access {
         let index = ArcSwap::from_pointee(Index::new(Arc::new(list), here));
         let (reloading, writing, holders) = (Mutex::default(), Mutex::default(), Mutex::default());
         let (memberships, pending) = (Mutex::default(), PendingRequests::default());
-        Self { here, path, refusals, index, reloading, writing, holders, memberships, pending }
+        let participants = Participants::default();
+        Self { here, path, refusals, index, reloading, writing, holders, memberships, pending, participants }
     }
 
     /// Reads the file again and puts its list in force for all later messages.
@@ -465,6 +470,10 @@ impl Guard for Access {
         if header.destination.node != self.here || !header.destination.app.is_layer() {
             self.pending.note(Time::now(), header);
         }
+    }
+
+    fn sets(&self, set: &Message) {
+        self.participants.note(Time::now(), set);
     }
 }
 

@@ -1,7 +1,8 @@
 //! The parameters of an application: answers to questions about them, and sets that are applied at a tick.
 //!
 //! The framework handles these messages, before and beside the application's own handlers. A set waits for the next
-//! tick of the periodic timer with the shortest period, and is applied before that timer's action.
+//! tick of the periodic timer with the shortest period, and is applied before that timer's action. The values of a
+//! transaction wait for the first tick at or after its stated time; the participants' messages are sent from here.
 
 use std::{
     sync::{Arc, OnceLock},
@@ -10,17 +11,19 @@ use std::{
 
 use actix::Actor;
 use sinew_params::{
-    AskParameters, ParameterError, ParameterList, ParameterOutcome, Parameters, SetParameters, TICK_WITHIN,
-    Tuner,
+    AskParameters, ParameterError, ParameterList, ParameterOutcome, ParameterVote, Parameters, SetParameters,
+    TICK_WITHIN, Tuner,
 };
 
 use super::{Action, AppContext};
 use crate::{
+    log,
     outcome::{Outcome, Rejection},
     schedule::{Tick, TimerId},
     sender::{ReplyTo, Sender},
+    tid::Tid,
     time::Time,
-    wire::{Flags, Message, Payload},
+    wire::{Flags, Header, Message, Payload},
 };
 
 impl Payload for AskParameters {
@@ -41,6 +44,12 @@ impl Payload for ParameterOutcome {
     const NAME: &'static str = "sinew.param.outcome";
 }
 
+impl Payload for ParameterVote {
+    const NAME: &'static str = "sinew.param.vote";
+    /// A later one of the same content has been sent by then.
+    const TIME_TO_LIVE: Option<Duration> = Some(TICK_WITHIN);
+}
+
 /// Called on the application's thread after a kept parameter has changed; it must not wait.
 pub(in crate::app) type KeptHook = Arc<OnceLock<Box<dyn Fn() + Send + Sync>>>;
 
@@ -52,8 +61,9 @@ pub(super) struct Tuning {
     on_kept: KeptHook,
     /// The application's periodic timers, in the order in which they were set.
     timers: Vec<(Duration, TimerId)>,
-    /// Whether a timer is set that refuses sets without a tick. There is at most one, however many sets arrive.
-    is_expiry_set: bool,
+    /// The timer that refuses sets without a tick and continues a transaction, and when it fires. There is at most one,
+    /// however many sets arrive.
+    expiry: Option<(Duration, TimerId)>,
 }
 
 impl Tuning {
@@ -88,21 +98,22 @@ impl<A: Actor<Context = Self>> AppContext<A> {
 
     /// Handles a message about parameters. `None`: it is another message, or the application has no parameters.
     pub(in crate::app) fn serve_parameters(&mut self, message: &Message, now: Time) -> Option<Outcome> {
-        let kind = message.header.kind;
-        if self.tuning.tuner.is_none() || ![AskParameters::KIND, SetParameters::KIND].contains(&kind) {
+        self.tuning.tuner.as_ref()?;
+        let Header { kind, source, flags, .. } = message.header;
+        let reply_to = flags.has(Flags::ASK).then(|| ReplyTo::of(&message.header));
+        let served = if kind == AskParameters::KIND {
+            Ok(self.list_parameters(reply_to))
+        } else if kind == SetParameters::KIND {
+            message.decode().map(|set| self.set_parameters(&set, &message.header, reply_to, now))
+        } else if kind == ParameterVote::KIND {
+            message.decode().map(|vote| self.take_vote(source, vote, now))
+        } else {
             return None;
-        }
-        let reply_to = message.header.flags.has(Flags::ASK).then(|| ReplyTo::of(&message.header));
-        if kind == AskParameters::KIND {
-            return Some(self.list_parameters(reply_to));
-        }
-        Some(match message.decode::<SetParameters>() {
-            Ok(set) => self.set_parameters(&set, reply_to, now),
-            Err(error) => {
-                self.warn_of_payload(message.header.source, &error, now);
-                Outcome::Rejected(Rejection::Malformed)
-            }
-        })
+        };
+        Some(served.unwrap_or_else(|error| {
+            self.warn_of_payload(source, &error, now);
+            Outcome::Rejected(Rejection::Malformed)
+        }))
     }
 
     fn list_parameters(&self, reply_to: Option<ReplyTo>) -> Outcome {
@@ -113,20 +124,67 @@ impl<A: Actor<Context = Self>> AppContext<A> {
         Outcome::Delivered
     }
 
-    /// Stages a set for the next tick. Without a periodic timer it is applied now, between two messages.
-    fn set_parameters(&mut self, set: &SetParameters, reply_to: Option<ReplyTo>, now: Time) -> Outcome {
+    /// Stages a set for the next tick. Without a periodic timer it is applied now, between two messages. A transaction
+    /// is answered at once.
+    fn set_parameters(
+        &mut self,
+        set: &SetParameters,
+        header: &Header,
+        reply_to: Option<ReplyTo>,
+        now: Time,
+    ) -> Outcome {
         let has_ticks = self.tuning.timer().is_some();
         let Some(tuner) = &mut self.tuning.tuner else { return Outcome::Rejected(Rejection::UnknownKind) };
-        let until = reply_to.map_or(Time::MAX, |to| to.deadline()).min(now + TICK_WITHIN);
-        if let Err((to, why)) = tuner.stage(set, (reply_to, since_origin(until)), has_ticks) {
-            return refuse(&self.sender, to, &why);
+        let answer = match set {
+            SetParameters::Prepare(transaction) => {
+                let sent = header.known_sent().zip(header.sent_error());
+                let sent = sent.map(|(sent, error)| (since_origin(sent), error));
+                let own = self.sender.tid().bits();
+                tuner.prepare(transaction, own, sent, since_origin(now), has_ticks).map(Some)
+            }
+            SetParameters::Conclude(id) => Ok(Some(tuner.outcome_of(*id, since_origin(now)))),
+            SetParameters::Values(_) | SetParameters::Undo => {
+                let until = reply_to.map_or(Time::MAX, |to| to.deadline()).min(now + TICK_WITHIN);
+                let staged = tuner.stage(set, (reply_to, since_origin(until)), has_ticks);
+                staged.map(|()| None).map_err(|(_, why)| why)
+            }
+        };
+        match answer {
+            Ok(Some(outcome)) => reply(&self.sender, reply_to, &outcome),
+            Ok(None) if !has_ticks => self.apply_parameters((0, Duration::ZERO), now),
+            Ok(None) => {}
+            Err(why) => return refuse(&self.sender, reply_to, &why),
         }
-        if has_ticks {
-            self.watch_deadline();
-        } else {
-            self.apply_parameters((0, Duration::ZERO), now);
-        }
+        self.send_votes();
         Outcome::Delivered
+    }
+
+    /// Handles a message of another participant of a transaction.
+    fn take_vote(&mut self, source: Tid, vote: ParameterVote, now: Time) -> Outcome {
+        if let Some(tuner) = &mut self.tuning.tuner {
+            tuner.on_vote(since_origin(now), source.bits(), vote);
+        }
+        self.send_votes();
+        Outcome::Delivered
+    }
+
+    /// Sends the messages to the other participants of a transaction, and sets the timer of its next step.
+    fn send_votes(&mut self) {
+        if let Some(tuner) = &mut self.tuning.tuner {
+            while let Some((to, vote)) = tuner.take_vote() {
+                // It is sent again until its receiver has answered, or the doubt ends.
+                let _ = self.sender.send(Tid::from_bits(to), &vote);
+            }
+            if let Some(id) = tuner.take_late() {
+                log::warn!(
+                    application = %self.sender.tid(),
+                    "a transaction of {} was applied late, as this application learned late that all had accepted it: look \
+                     whether it was cut off or paused (`sinew nodes`, `sinew apps`)",
+                    Tid::from_bits(id.coordinator)
+                );
+            }
+        }
+        self.watch_deadline();
     }
 
     /// Applies the sets that wait, and moves values with a slope, before the action of this timer.
@@ -140,30 +198,41 @@ impl<A: Actor<Context = Self>> AppContext<A> {
 
     fn apply_parameters(&mut self, tick: (u64, Duration), now: Time) {
         let Some(tuner) = &mut self.tuning.tuner else { return };
+        let has_transaction = !tuner.is_idle();
         let is_kept_changed =
             tuner.tick(tick, since_origin(now), |to, outcome| reply(&self.sender, to, &outcome));
         if let Some(on_kept) = self.tuning.on_kept.get().filter(|_| is_kept_changed) {
             on_kept();
         }
+        if has_transaction {
+            self.send_votes();
+        }
     }
 
-    /// Refuses the sets for which no tick came in time.
+    /// Refuses the sets for which no tick came in time, and takes the steps of a transaction that are due.
     pub(in crate::app) fn expire_parameters(&mut self, now: Time) {
-        if let Some(tuner) = &mut self.tuning.tuner {
+        self.tuning.expiry = None;
+        if self.tuning.timer().is_none() {
+            // Agreed values apply between two messages.
+            self.apply_parameters((0, Duration::ZERO), now);
+        } else if let Some(tuner) = &mut self.tuning.tuner {
             tuner.expire(since_origin(now), |to, outcome| reply(&self.sender, to, &outcome));
         }
-        self.tuning.is_expiry_set = false;
-        self.watch_deadline();
+        self.send_votes();
     }
 
-    /// Sets the timer for the first deadline of the sets that wait.
+    /// Sets the timer for the first deadline of the sets that wait, and of a transaction.
     fn watch_deadline(&mut self) {
         let deadline = self.tuning.tuner.as_ref().and_then(Tuner::next_deadline);
-        if let Some(deadline) = deadline.filter(|_| !self.tuning.is_expiry_set) {
-            let at = Time::ZERO + deadline;
-            self.schedule.once(at, Action::ExpireParameters);
-            self.tuning.is_expiry_set = true;
+        let Some(deadline) = deadline else { return };
+        if let Some((at, timer)) = self.tuning.expiry {
+            if at <= deadline {
+                return;
+            }
+            self.schedule.cancel(timer);
         }
+        let timer = self.schedule.once(Time::ZERO + deadline, Action::ExpireParameters);
+        self.tuning.expiry = Some((deadline, timer));
     }
 }
 

@@ -3,7 +3,9 @@
 use std::sync::Arc;
 
 use actix::Actor;
-use sinew_params::{AskParameters, ParameterList, ParameterOutcome, Parameters, SetParameters};
+use sinew_params::{
+    AskParameters, ParameterList, ParameterOutcome, ParameterVote, Parameters, SetParameters,
+};
 
 use super::AppSpec;
 use crate::{
@@ -19,6 +21,9 @@ impl<A: Actor<Context = AppContext<A>>> AppSpec<A> {
     /// period ([`AppContext::every`]), before the timer's action. So all values that one tick reads belong together.
     /// Without a periodic timer it is applied between two messages. If no tick comes within 1 s the set is refused, and
     /// is not applied later.
+    ///
+    /// Several applications, also of several nodes, are set as one by a transaction: see
+    /// [`Sender::set_together`](crate::sender::Sender::set_together).
     ///
     /// An application has one set of parameters, and no other application of its process may have the same one. After a
     /// restart by its supervisor a parameter has its default again, unless it is declared with `keep`. With
@@ -56,13 +61,15 @@ impl<A: Actor<Context = AppContext<A>>> AppSpec<A> {
     /// ```
     #[must_use]
     pub fn params<P: Parameters>(mut self, parameters: &Arc<P>) -> Self {
-        self.common.types.extend(remember::<AskParameters>().into_iter().chain(remember::<SetParameters>()));
-        self.common
-            .sends
-            .extend(remember::<ParameterList>().into_iter().chain(remember::<ParameterOutcome>()));
-        for (kind, name) in
-            [(AskParameters::KIND, AskParameters::NAME), (SetParameters::KIND, SetParameters::NAME)]
-        {
+        let handled = remember::<AskParameters>().into_iter().chain(remember::<SetParameters>());
+        self.common.types.extend(handled.chain(remember::<ParameterVote>()));
+        let sent = remember::<ParameterList>().into_iter().chain(remember::<ParameterOutcome>());
+        self.common.sends.extend(sent.chain(remember::<ParameterVote>()));
+        for (kind, name) in [
+            (AskParameters::KIND, AskParameters::NAME),
+            (SetParameters::KIND, SetParameters::NAME),
+            (ParameterVote::KIND, ParameterVote::NAME),
+        ] {
             self.common.kinds.push((kind, name));
         }
         self.common.parameter_sets += 1;

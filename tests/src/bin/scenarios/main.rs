@@ -12,6 +12,7 @@ mod growth;
 mod hostile_client;
 mod layer_panics;
 mod link_faults;
+mod params;
 mod recording;
 mod recovery;
 mod slow_consumer;
@@ -35,6 +36,7 @@ enum Scenario {
     HostileClient(hostile_client::Arguments),
     LayerPanics(layer_panics::Arguments),
     LinkFaults(link_faults::Arguments),
+    Params(params::Arguments),
     Recording(recording::Arguments),
     Recovery(recovery::Arguments),
     SlowConsumer(slow_consumer::Arguments),
@@ -56,6 +58,7 @@ fn main() -> ExitCode {
         Scenario::HostileClient(arguments) => hostile_client::execute(arguments),
         Scenario::LayerPanics(arguments) => layer_panics::execute(arguments),
         Scenario::LinkFaults(arguments) => link_faults::execute(arguments),
+        Scenario::Params(arguments) => params::execute(arguments),
         Scenario::Recording(arguments) => recording::execute(arguments),
         Scenario::Recovery(arguments) => recovery::execute(arguments),
         Scenario::SlowConsumer(arguments) => slow_consumer::execute(arguments),

@@ -5,7 +5,7 @@ use std::fmt;
 use sinew_model::refusals::BY_LIST;
 use sinew_runtime::{
     lock,
-    parameters::{AskParameters, SetParameters},
+    parameters::{AskParameters, ParameterVote, SetParameters},
     tid::{AppAddress, Tid},
     time::Time,
     wire::{Header, Payload},
@@ -17,9 +17,16 @@ use crate::access::selector::Selector;
 impl Access {
     /// Decides about a message that sets or reads parameters of the application at `app`. `None`: the rules decide.
     ///
+    /// The participants of a transaction, which an operator has named to each of them, agree without a rule, and no
+    /// others by any rule. Guests take no part.
+    ///
     /// Only an operator may set them. Operators and observers may read them without a rule; others need one, as for any
     /// message.
     pub(super) fn decide_by_role(&self, header: &Header, app: AppAddress) -> Option<bool> {
+        if header.kind == ParameterVote::KIND {
+            // One that comes before its transaction is refused without a log line: it is sent again.
+            return Some(self.participants.has(Time::now(), header, app) && !self.is_foreign(header.source));
+        }
         let is_set = header.kind == SetParameters::KIND;
         if !is_set && header.kind != AskParameters::KIND {
             return None;

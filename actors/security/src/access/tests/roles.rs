@@ -1,9 +1,11 @@
 //! Roles: operators may set parameters, observers may read them.
 
 use sinew_runtime::{
-    parameters::{AskParameters, SetParameters},
+    parameters::{
+        AskParameters, ParameterTransaction, ParameterVote, Participant, SetParameters, TransactionId,
+    },
     router::guard::Guard as _,
-    wire::Payload,
+    wire::{Message, Payload},
 };
 
 use super::*;
@@ -66,6 +68,36 @@ fn reply_sets_no_parameters_without_the_role() {
     };
     assert!(may_reply(Kind::named("test.answer"), 1));
     assert!(!may_reply(SetParameters::KIND, 2));
+}
+
+#[test]
+fn participants_that_an_operator_names_need_no_rule() {
+    let place = place();
+    let access = place.access("[[rule]]\nfrom = ['*']\nto = ['*']\n[roles]\noperators = ['here']\n");
+    let (knee, other) = (Tid::new(HERE, AppAddress::new(0x1001)), Tid::new(HERE, AppAddress::new(0x1002)));
+    let guest = Tid::new(HERE, AppAddress::new(0x1006));
+    access.add_guest(guest.app, rustix::process::geteuid().as_raw() + 7);
+    let hip = app(THERE, 0x1005);
+    let vote = |source, to: Tid| {
+        access.allows(
+            &Header::new(ParameterVote::KIND, source, to),
+            if to.app.is_group() { knee.app } else { to.app },
+        )
+    };
+    // Before the begin, and between others, not even a rule allows it.
+    assert!(!vote(hip, knee));
+    let named = |tid: Tid| Participant { tid: tid.bits(), app: String::new() };
+    let transaction = ParameterTransaction {
+        id: TransactionId { coordinator: other.bits(), began_ns: 1 },
+        participants: [knee, hip, guest].map(named).to_vec(),
+        values: Vec::new(),
+        lead_ns: 1,
+        applies_after_ns: 1,
+    };
+    access.sets(&Message::typed(other, knee, &SetParameters::Prepare(transaction)));
+    assert!(vote(hip, knee) && vote(knee, knee));
+    assert!(!vote(hip, other) && !vote(app(THERE, 0x1007), knee));
+    assert!(!vote(guest, knee) && !vote(hip, Tid::group("drives")));
 }
 
 #[test]
