@@ -4,6 +4,7 @@ mod access;
 mod bag;
 mod doctor;
 mod fault;
+mod foxglove;
 mod keys;
 mod logs;
 mod mistakes;
