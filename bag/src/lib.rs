@@ -4,6 +4,8 @@
 //! it was sent (`msgpack`), and a view with a schema (`protobuf`) for Foxglove, PlotJuggler, Rerun and other tools.
 //! `docs/protocol/recording.md` specifies the topics, the metadata and the fields.
 //!
+//! [`ViewWriter`] makes the same channels and views without a file, for programs that show messages as they come.
+//!
 //! [`read`] opens finished and unfinished files, [`check()`] proves that nothing is missing, [`info()`] sums a file up,
 //! [`merge()`] puts the files of several nodes on one time line, and `export` writes CSV and Parquet, unless the
 //! feature of this name is off.
@@ -39,4 +41,4 @@ pub use terms::{
     ChannelId, ChannelInfo, Class, ClockReading, Compression, Direction, Event, EventTopic, Level, Options,
     Origin, Party, Record, Totals,
 };
-pub use writer::BagWriter;
+pub use writer::{BagWriter, ViewChannel, ViewItem, ViewWriter};

@@ -44,13 +44,23 @@ pub(crate) fn typed_channel(
     direction: Direction,
     type_name: &str,
 ) -> ChannelId {
+    with_info(class, direction, type_name, |info| bag.channel(info)).unwrap()
+}
+
+/// Calls `act` with the description of such a channel.
+pub(crate) fn with_info<R>(
+    class: Class,
+    direction: Direction,
+    type_name: &str,
+    act: impl FnOnce(&ChannelInfo<'_>) -> R,
+) -> R {
     let party = |tid: u64, node: &str, name: Option<&str>| Party {
         tid,
         text: format!("{node}/1"),
         name: name.map(str::to_owned),
         node: Some(node.to_owned()),
     };
-    bag.channel(&ChannelInfo {
+    act(&ChannelInfo {
         source: &party(1, "127.0.0.2", Some("knee.sensor")),
         destination: &party(2, "127.0.0.3", None),
         type_name,
@@ -62,7 +72,6 @@ pub(crate) fn typed_channel(
         refused: None,
         seen_before: 0,
     })
-    .unwrap()
 }
 
 /// Same as [`channel`], of class Stream.

@@ -5,6 +5,7 @@ mod part;
 mod records;
 #[cfg(test)]
 mod tests;
+mod views;
 
 use std::{collections::BTreeSet, io::ErrorKind, path::PathBuf};
 
@@ -19,6 +20,7 @@ use part::Part;
 
 pub(crate) use part::{METADATA, cause};
 pub(crate) use records::{CLOCK_TOPIC, TALLY_TOPIC};
+pub use views::{ViewChannel, ViewItem, ViewWriter};
 
 /// Maximum channels of a recording. Each has two in the file, and MCAP has room for 65,535.
 const CHANNELS_MAX: usize = 16_384;

@@ -4,6 +4,7 @@
 //! its node would report a client that does not read. They are dropped without a wait for the node, which may have died
 //! meanwhile. So have the questions about parameters and the readers of messages.
 
+mod live;
 mod messages;
 mod questions;
 
@@ -19,11 +20,13 @@ use clap::Args;
 use serde_json::json;
 use sinew::{
     Endpoint, NodeAddress, NodeApi, Tid, Time,
-    inspect::{AskNode, NodeReport},
+    inspect::{AskNode, NodeReport, Selection},
     parameters::{ParameterOutcome, SetParameters},
     stop::StopReport,
 };
-use sinew_view::{AppParameters, NODES_MAX, NodeAnswers, Server, Snapshot, Source, StopAct, Tap};
+use sinew_view::{
+    AppParameters, Live, NODES_MAX, NodeAnswers, Server, Snapshot, Source, StopAct, Tap, Writes,
+};
 
 use crate::{
     Report,
@@ -32,6 +35,7 @@ use crate::{
     system::{REQUESTERS_MAX, System, SystemError, present, register},
     table::clean,
 };
+use live::Channels;
 use messages::Messages;
 use questions::Questions;
 
@@ -45,13 +49,48 @@ pub(crate) struct Order {
     /// network
     #[arg(long, value_name = "ADDRESS:PORT", default_value = "127.0.0.1:9464")]
     listen: SocketAddr,
+    /// Also serves Foxglove, Lichtblick and other clients of its protocol, on this port of the same address
+    #[arg(long, value_name = "PORT", num_args = 0..=1, default_missing_value = "8765")]
+    foxglove: Option<u16>,
+    /// Offers Foxglove only messages from or to applications of this name, with `*` for any text; may be repeated
+    #[arg(long = "foxglove-app", value_name = "NAME", requires = "foxglove")]
+    foxglove_apps: Vec<String>,
+    /// Lets Foxglove set parameters, as far as the nodes let this command
+    #[arg(long, requires = "foxglove")]
+    foxglove_writes: bool,
+}
+
+impl Order {
+    /// Binds the server for Foxglove, if it is wanted. Returns its address, with the token.
+    fn bind_foxglove(&self, server: &mut Server) -> Result<Option<String>, SystemError> {
+        let Some(port) = self.foxglove else { return Ok(None) };
+        let writes = if self.foxglove_writes { Writes::Allowed } else { Writes::Refused };
+        let bound = server.bind_foxglove(port, writes).map_err(|why| {
+            let ip = self.listen.ip();
+            SystemError::View(format!(
+                "port {port} of {ip} cannot be listened on for Foxglove: {why}; end the program that has it, or choose another one with --foxglove PORT"
+            ))
+        });
+        bound.map(Some)
+    }
+
+    /// Returns the selection of the messages that Foxglove is offered.
+    fn shown(&self) -> Result<Selection, SystemError> {
+        let shown = Selection { apps: self.foxglove_apps.clone(), ..Selection::default() };
+        shown
+            .check()
+            .map_err(|why| SystemError::Usage(format!("--foxglove-app: {}", clean(&why.to_string()))))?;
+        Ok(shown)
+    }
 }
 
 /// Serves the page and the metrics until the user ends it.
 pub(crate) fn show(order: &Order, arguments: &Arguments) -> Result<Report, SystemError> {
-    let (nodes, _) = Nodes::enter(arguments)?;
+    let shown = order.shown()?;
+    let (mut nodes, _) = Nodes::enter(arguments)?;
+    nodes.shown = shown;
     let path = nodes.path();
-    let server = Server::bind(order.listen).map_err(|why| {
+    let mut server = Server::bind(order.listen).map_err(|why| {
         let listen = order.listen;
         SystemError::View(format!("{listen} cannot be listened on: {why}; choose another one with --listen"))
     })?;
@@ -61,16 +100,8 @@ pub(crate) fn show(order: &Order, arguments: &Arguments) -> Result<Report, Syste
             "sinew: warning: {address} is not loopback: every program that reaches it can read the metrics of all nodes, and the page and its token travel without encryption"
         ));
     }
-    let announcement = if arguments.json {
-        json!({ "listens": address.to_string(), "through": path, "page": server.page() }).to_string()
-    } else {
-        format!(
-            "http://{address}/metrics has the metrics of all nodes, through {}; Ctrl-C ends it\n{} is the page, for its bearer alone",
-            clean(&path),
-            server.page()
-        )
-    };
-    output::line(&announcement);
+    let foxglove = order.bind_foxglove(&mut server)?;
+    output::line(&announcement(&server, &path, foxglove.as_deref(), arguments.json));
     let end = server.run(nodes);
     end.map_err(|why| {
         SystemError::View(format!("the system gives no thread or descriptor: {why}; free some"))
@@ -78,8 +109,27 @@ pub(crate) fn show(order: &Order, arguments: &Arguments) -> Result<Report, Syste
     Ok(Report { text: String::new(), json: serde_json::Value::Null, is_fine: true })
 }
 
+fn announcement(server: &Server, path: &str, foxglove: Option<&str>, is_json: bool) -> String {
+    let (address, page) = (server.address(), server.page());
+    if is_json {
+        let listens = address.to_string();
+        return json!({ "listens": listens, "through": path, "page": page, "foxglove": foxglove })
+            .to_string();
+    }
+    let mut text = format!(
+        "http://{address}/metrics has the metrics of all nodes, through {}; Ctrl-C ends it\n{page} is the page, for its bearer alone",
+        clean(path)
+    );
+    if let Some(foxglove) = foxglove {
+        text += &format!("\n{foxglove} is for Foxglove and its like, for their bearer alone");
+    }
+    text
+}
+
 /// All nodes, asked through one of them.
 pub(crate) struct Nodes {
+    /// The selection of the messages that Foxglove is offered.
+    shown: Selection,
     api: NodeApi,
     /// Time limit for each answer.
     within: Duration,
@@ -161,7 +211,7 @@ impl Source for Nodes {
         let mut system = self.entry.enter(self.within)?;
         let (outcome, text) = param::set(&mut system, app, set);
         self.entry.leave(system);
-        output::note(format_args!("sinew: a set of the page: {}", text.trim_end()));
+        output::note(format_args!("sinew: a set through sinew view: {}", text.trim_end()));
         outcome
     }
 
@@ -182,6 +232,10 @@ impl Source for Nodes {
     fn tap(&self) -> Box<dyn Tap> {
         Box::new(Messages::new(Arc::clone(&self.entry), self.within))
     }
+
+    fn live(&self) -> Box<dyn Live> {
+        Box::new(Channels::new(Arc::clone(&self.entry), self.within, self.shown.clone()))
+    }
 }
 
 /// Returns the names of all applications.
@@ -198,7 +252,8 @@ impl Nodes {
     /// As with other commands: a node that refuses or is silent at the start.
     pub(crate) fn enter(arguments: &Arguments) -> Result<(Self, Snapshot), SystemError> {
         let (socket, api) = sockets::find(arguments.socket.as_deref())?;
-        let nodes = Self { api, within: arguments.within(), entry: Arc::new(Entry::new(socket)) };
+        let entry = Arc::new(Entry::new(socket));
+        let nodes = Self { shown: Selection::default(), api, within: arguments.within(), entry };
         let snapshot = nodes.snapshot();
         match &snapshot.entry {
             Ok(_) => Ok((nodes, snapshot)),

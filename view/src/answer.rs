@@ -29,6 +29,7 @@ use crate::{
     body::Content,
     cache::{Cache, FRESH, PAGE_FRESH},
     events::EventLog,
+    foxglove::Hub,
     listed::Listed,
     metrics::{self, Format},
     model,
@@ -58,6 +59,8 @@ pub(crate) struct Shared {
     pub(crate) cache: Cache,
     pub(crate) pages: Pages,
     pub(crate) states: States,
+    /// The clients of Foxglove's protocol, if there is a server for them.
+    foxglove: Option<Hub>,
     listed: Listed,
     log: Mutex<EventLog>,
     questions: Arc<Semaphore>,
@@ -69,15 +72,16 @@ pub(crate) struct Shared {
 }
 
 impl Shared {
-    pub(crate) fn new(source: Arc<dyn Source>, cache: Cache, pages: Pages, log: EventLog) -> Self {
+    pub(crate) fn new(source: Arc<dyn Source>, cache: Cache, pages: Pages, foxglove: Option<Hub>) -> Self {
         let slots = |count| Arc::new(Semaphore::new(count));
         Self {
             source,
             cache,
             pages,
             states: States::default(),
+            foxglove,
             listed: Listed::default(),
-            log: Mutex::new(log),
+            log: Mutex::default(),
             questions: slots(QUESTIONS_MAX),
             stop: Listed::default(),
             stop_questions: slots(1),
@@ -95,7 +99,7 @@ impl Shared {
         let source: Arc<dyn Source> = Arc::new(crate::source::NoSystem);
         let cache = Cache::start(Arc::clone(&source), Duration::ZERO).expect("a thread");
         let pages = Pages::start(Arc::clone(&source)).expect("a thread");
-        Arc::new(Self::new(source, cache, pages, EventLog::default()))
+        Arc::new(Self::new(source, cache, pages, None))
     }
 
     /// Adds a set with its outcome to the log of events.
@@ -187,7 +191,8 @@ async fn metrics(shared: &Shared, format: Format) -> Response<Content> {
         let why = format!("the nodes gave no answer within {ANSWER_WITHIN:?}; try again");
         return plain(StatusCode::SERVICE_UNAVAILABLE, why);
     };
-    match metrics::encode(&snapshot, Time::now(), format) {
+    let foxglove = shared.foxglove.as_ref().map(Hub::counts);
+    match metrics::encode(&snapshot, foxglove, Time::now(), format) {
         Ok(text) => response(StatusCode::OK, format.content_type(), Content::whole(text.into())),
         Err(_) => {
             plain(StatusCode::INTERNAL_SERVER_ERROR, "the metrics cannot be written as text".to_owned())
@@ -196,15 +201,20 @@ async fn metrics(shared: &Shared, format: Format) -> Response<Content> {
 }
 
 async fn parameters(shared: &Arc<Shared>) -> Response<Content> {
+    match listed(shared).await {
+        Ok(list) => json(StatusCode::OK, &list),
+        Err(why) => json(StatusCode::SERVICE_UNAVAILABLE, &json!({ "fault": why })),
+    }
+}
+
+/// Returns the parameters of all applications, as JSON: the latest list, or a new one.
+pub(crate) async fn listed(shared: &Arc<Shared>) -> Result<serde_json::Value, String> {
     let ask = || async {
         let apps = asked(shared, &shared.questions, |source| source.parameters()).await.flatten()?;
         Ok::<_, String>(model::parameters(&apps))
     };
     let late = || Err(format!("the nodes gave no answer within {ASKED_WITHIN:?}; try again"));
-    match timeout(ASKED_WITHIN, shared.listed.get(PAGE_FRESH, ask)).await.unwrap_or_else(|_| late()) {
-        Ok(list) => json(StatusCode::OK, &list),
-        Err(why) => json(StatusCode::SERVICE_UNAVAILABLE, &json!({ "fault": why })),
-    }
+    timeout(ASKED_WITHIN, shared.listed.get(PAGE_FRESH, ask)).await.unwrap_or_else(|_| late())
 }
 
 /// Presses or releases the stop. The act is recorded in the log of events and on the terminal.
@@ -267,7 +277,11 @@ async fn set(shared: &Arc<Shared>, body: Incoming) -> Response<Content> {
 }
 
 /// Sets parameters. Its outcome is logged where it is known: the page may have closed its connection meanwhile.
-async fn apply(shared: &Arc<Shared>, app: String, order: SetParameters) -> Result<ParameterOutcome, String> {
+pub(crate) async fn apply(
+    shared: &Arc<Shared>,
+    app: String,
+    order: SetParameters,
+) -> Result<ParameterOutcome, String> {
     let of = Arc::clone(shared);
     let outcome = asked(shared, &shared.questions, move |source| {
         let outcome = source.set(&app, &order);
@@ -329,7 +343,7 @@ fn json(status: StatusCode, value: &serde_json::Value) -> Response<Content> {
     response(status, "application/json", Content::whole(value.to_string().into()))
 }
 
-fn refused(error: RequestError) -> Response<Content> {
+pub(crate) fn refused(error: RequestError) -> Response<Content> {
     let mut response = plain(error.status(), error.to_string());
     if let RequestError::Method(allowed) = error {
         response.headers_mut().insert(ALLOW, HeaderValue::from_static(allowed));

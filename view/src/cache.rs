@@ -105,7 +105,7 @@ mod tests {
 
     use super::*;
     use crate::{
-        source::{AppParameters, NoSystem, Tap},
+        source::{AppParameters, Live, NoSystem, Tap},
         stop::StopAct,
     };
 
@@ -137,6 +137,10 @@ mod tests {
 
         fn tap(&self) -> Box<dyn Tap> {
             NoSystem.tap()
+        }
+
+        fn live(&self) -> Box<dyn Live> {
+            NoSystem.live()
         }
     }
 

@@ -9,6 +9,7 @@
 //!                                   ▲ points, tables ◄── pages ◄── thread `messages` ──► Tap::poll
 //!         ── POST /api/parameters ──► answer ──► Source::set
 //!         ── POST /api/stop ────────► answer ──► Source::stop
+//! Foxglove ─ WebSocket ──────► foxglove ◄── thread `foxglove` ──► Live::poll
 //! ```
 //!
 //! | module | content |
@@ -23,6 +24,7 @@
 //! | `look`, `scope` | the messages at which one page looks |
 //! | `fields`, `decimate` | the numbers of a payload, and series with few points |
 //! | `pages`, `stream` | the open pages, and the stream of each |
+//! | `foxglove` | the server for Foxglove |
 //! | `assets` | the files of the page |
 //! | `auth`, `request` | the token, and which request is refused, and why |
 //! | `cache` | the thread that asks, and the latest snapshot |
@@ -37,6 +39,7 @@ mod cache;
 mod decimate;
 mod events;
 mod fields;
+mod foxglove;
 mod listed;
 mod look;
 mod metrics;
@@ -51,8 +54,9 @@ mod source;
 mod stop;
 mod stream;
 
+pub use foxglove::Writes;
 pub use metrics::{METRICS, Metric, Shape};
 pub use server::Server;
 pub use snapshot::{Answers, NODES_MAX, NodeAnswers, Snapshot};
-pub use source::{AppParameters, NoSystem, Sighting, Source, Tap};
+pub use source::{AppParameters, Live, LiveChannel, LiveItem, NoSystem, Sighting, Source, Tap};
 pub use stop::StopAct;

@@ -85,6 +85,17 @@ pub(crate) enum RequestError {
     /// The query of a stream is illegal.
     #[error("the query is too long, names too much or has unknown parts; open fewer plots")]
     Query,
+    /// It has not the token of the server for Foxglove.
+    #[error(
+        "this needs the token of this start; connect to the address that sinew view has printed for Foxglove"
+    )]
+    NoFoxgloveToken,
+    /// It opens no WebSocket.
+    #[error("this port is for WebSocket clients; connect Foxglove to it, or another client of its protocol")]
+    NoWebSocket,
+    /// It names no protocol of the server for Foxglove.
+    #[error("the client names no protocol of this server; it has foxglove.websocket.v1 and foxglove.sdk.v1")]
+    NoProtocol,
     /// There is no such document.
     #[error("there is no such page; try / or /metrics")]
     NoPage,
@@ -93,8 +104,9 @@ pub(crate) enum RequestError {
 impl RequestError {
     pub(crate) const fn status(self) -> StatusCode {
         match self {
-            Self::NoHost | Self::Query => StatusCode::BAD_REQUEST,
-            Self::NoToken => StatusCode::UNAUTHORIZED,
+            Self::NoHost | Self::Query | Self::NoProtocol => StatusCode::BAD_REQUEST,
+            Self::NoToken | Self::NoFoxgloveToken => StatusCode::UNAUTHORIZED,
+            Self::NoWebSocket => StatusCode::UPGRADE_REQUIRED,
             Self::OtherHost | Self::OtherSite => StatusCode::FORBIDDEN,
             Self::Method(_) => StatusCode::METHOD_NOT_ALLOWED,
             Self::Body => StatusCode::PAYLOAD_TOO_LARGE,
@@ -177,7 +189,7 @@ fn check_site(headers: &HeaderMap, host: &Authority, needs_origin: bool) -> Resu
 }
 
 /// Returns the host that the request is for.
-fn check_host(head: Head<'_>, listens: IpAddr) -> Result<Authority, RequestError> {
+pub(crate) fn check_host(head: Head<'_>, listens: IpAddr) -> Result<Authority, RequestError> {
     let mut hosts = head.headers.get_all(HOST).iter();
     let (Some(host), None) = (hosts.next(), hosts.next()) else { return Err(RequestError::NoHost) };
     let host = host.to_str().ok().and_then(|text| text.parse::<Authority>().ok());

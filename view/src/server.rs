@@ -3,6 +3,7 @@
 
 use std::{
     convert::Infallible,
+    future::pending,
     io,
     net::{Ipv4Addr, Ipv6Addr, SocketAddr, TcpListener},
     pin::pin,
@@ -19,8 +20,8 @@ use crate::{
     answer::{self, Identity, Shared},
     auth::{self, Token},
     cache::{Cache, PAGE_FRESH},
-    events::EventLog,
-    pages::Pages,
+    foxglove::{self, Hub, Writes},
+    pages::{Pages, wall_s},
     source::Source,
     stream::Line,
 };
@@ -28,11 +29,11 @@ use crate::{
 /// Maximum number of connections at a time. Further ones wait until one ends.
 const CONNECTIONS_MAX: usize = 64;
 /// Maximum bytes of the first part of a request.
-const HEAD_BYTES_MAX: usize = 8 * 1_024;
+pub(crate) const HEAD_BYTES_MAX: usize = 8 * 1_024;
 /// Maximum number of headers of a request.
-const HEADERS_MAX: usize = 64;
+pub(crate) const HEADERS_MAX: usize = 64;
 /// Time limit for the first part of a request.
-const HEAD_WITHIN: Duration = Duration::from_secs(5);
+pub(crate) const HEAD_WITHIN: Duration = Duration::from_secs(5);
 /// Time limit for a connection as a whole, also for a client that does not read. A stream has another one: that of its
 /// reader.
 const CONNECTION_WITHIN: Duration = Duration::from_secs(15);
@@ -45,6 +46,14 @@ pub struct Server {
     listener: TcpListener,
     address: SocketAddr,
     token: Token,
+    foxglove: Option<Foxglove>,
+}
+
+/// The bound server for Foxglove.
+#[derive(Debug)]
+struct Foxglove {
+    listener: TcpListener,
+    own: foxglove::Identity,
 }
 
 impl Server {
@@ -61,10 +70,33 @@ impl Server {
     /// # Ok::<(), std::io::Error>(())
     /// ```
     pub fn bind(address: SocketAddr) -> io::Result<Self> {
-        let listener = TcpListener::bind(address)?;
-        listener.set_nonblocking(true)?;
-        let address = listener.local_addr()?;
-        Ok(Self { listener, address, token: Token::random()? })
+        let (listener, address) = bind(address)?;
+        Ok(Self { listener, address, token: Token::random()?, foxglove: None })
+    }
+
+    /// Binds a server for Foxglove to this port of the same address; port 0 for any free one. Returns its address, with
+    /// the token of this start. It is a secret.
+    ///
+    /// # Errors
+    /// As [`bind`](Self::bind).
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew_view::{Server, Writes};
+    ///
+    /// let mut server = Server::bind("127.0.0.1:0".parse().expect("an address"))?;
+    /// let address = server.bind_foxglove(0, Writes::Refused)?;
+    /// assert!(address.starts_with("ws://127.0.0.1:") && address.contains("/?token="));
+    /// # Ok::<(), std::io::Error>(())
+    /// ```
+    pub fn bind_foxglove(&mut self, port: u16, writes: Writes) -> io::Result<String> {
+        let (listener, address) = bind(SocketAddr::new(self.address.ip(), port))?;
+        let token = Token::random()?;
+        let shown = format!("ws://{}/?token={}", reachable(address), token.text());
+        let own = foxglove::Identity { listens: address.ip(), token, writes };
+        self.foxglove = Some(Foxglove { listener, own });
+        Ok(shown)
     }
 
     /// Returns the address that it listens on.
@@ -84,13 +116,7 @@ impl Server {
     /// ```
     #[must_use]
     pub fn page(&self) -> String {
-        let mut address = self.address;
-        // A browser opens no unspecified address.
-        if address.ip().is_unspecified() {
-            let is_v4 = address.is_ipv4();
-            address.set_ip(if is_v4 { Ipv4Addr::LOCALHOST.into() } else { Ipv6Addr::LOCALHOST.into() });
-        }
-        format!("http://{address}/?token={}", self.token.text())
+        format!("http://{}/?token={}", reachable(self.address), self.token.text())
     }
 
     /// Answers requests until Ctrl-C or SIGTERM.
@@ -114,13 +140,21 @@ impl Server {
             let source: Arc<dyn Source> = Arc::new(source);
             let cache = Cache::start(Arc::clone(&source), PAGE_FRESH)?;
             let pages = Pages::start(Arc::clone(&source))?;
-            let shared = Arc::new(Shared::new(source, cache, pages, EventLog::default()));
+            let hub = self.foxglove.is_some().then(|| Hub::start(Arc::clone(&source), &session()));
+            let hub = hub.transpose()?;
+            let shared = Arc::new(Shared::new(source, cache, pages, hub.clone()));
             let cookie = auth::cookie_name(self.address.port());
             let own = Arc::new(Identity { listens: self.address.ip(), token: self.token, cookie });
-            tokio::select! {
+            let for_pages = |stream| serve(stream, Arc::clone(&shared), Arc::clone(&own));
+            let result = tokio::select! {
                 _ = signals.recv() => Ok(()),
-                never = accept(&listener, &shared, &own) => match never {},
+                never = accept(&listener, CONNECTIONS_MAX, for_pages) => match never {},
+                why = accept_foxglove(self.foxglove, &shared, hub.as_ref()) => Err(why),
+            };
+            if let Some(hub) = hub {
+                hub.end();
             }
+            result
         });
         // A question to the nodes may still wait for its answer: the program does not.
         runtime.shutdown_background();
@@ -128,15 +162,56 @@ impl Server {
     }
 }
 
-async fn accept(listener: &tokio::net::TcpListener, shared: &Arc<Shared>, own: &Arc<Identity>) -> Infallible {
-    let slots = Arc::new(Semaphore::new(CONNECTIONS_MAX));
+fn bind(address: SocketAddr) -> io::Result<(TcpListener, SocketAddr)> {
+    let listener = TcpListener::bind(address)?;
+    listener.set_nonblocking(true)?;
+    let address = listener.local_addr()?;
+    Ok((listener, address))
+}
+
+/// Returns an address that a client of this host can open, which is no unspecified one.
+fn reachable(mut address: SocketAddr) -> SocketAddr {
+    if address.ip().is_unspecified() {
+        let is_v4 = address.is_ipv4();
+        address.set_ip(if is_v4 { Ipv4Addr::LOCALHOST.into() } else { Ipv6Addr::LOCALHOST.into() });
+    }
+    address
+}
+
+/// Returns a text that another start has not: Foxglove takes the same one for a connection that has come back.
+fn session() -> String {
+    format!("{:x}", (wall_s() * 1e3) as u64)
+}
+
+/// Accepts clients of Foxglove's protocol, if there is a server for them. It returns only if it cannot listen.
+async fn accept_foxglove(server: Option<Foxglove>, shared: &Arc<Shared>, hub: Option<&Hub>) -> io::Error {
+    let (Some(Foxglove { listener, own }), Some(hub)) = (server, hub) else { return pending().await };
+    let listener = match tokio::net::TcpListener::from_std(listener) {
+        Ok(listener) => listener,
+        Err(why) => return why,
+    };
+    let own = Arc::new(own);
+    let serve = |stream| foxglove::serve(stream, Arc::clone(shared), hub.clone(), Arc::clone(&own));
+    match accept(&listener, foxglove::CONNECTIONS_MAX, serve).await {}
+}
+
+/// Serves each connection on a task of its own, as many at a time as there are slots.
+async fn accept<F>(
+    listener: &tokio::net::TcpListener,
+    slots: usize,
+    serve: impl Fn(TcpStream) -> F,
+) -> Infallible
+where
+    F: Future<Output = ()> + Send + 'static,
+{
+    let slots = Arc::new(Semaphore::new(slots));
     loop {
         let slot = Arc::clone(&slots).acquire_owned().await.expect("nothing closes the semaphore");
         match listener.accept().await {
             Ok((stream, _)) => {
-                let (shared, own) = (Arc::clone(shared), Arc::clone(own));
+                let served = serve(stream);
                 tokio::spawn(async move {
-                    serve(stream, shared, own).await;
+                    served.await;
                     drop(slot);
                 });
             }

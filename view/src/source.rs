@@ -1,6 +1,9 @@
 //! The system as the page and the metrics see it. The command `sinew` implements it through the socket of one node.
 
-use std::{collections::BTreeSet, time::Duration};
+use std::{
+    collections::{BTreeMap, BTreeSet},
+    time::Duration,
+};
 
 use sinew::{
     Tid, Time,
@@ -46,6 +49,10 @@ pub trait Source: Send + Sync + 'static {
 
     /// Returns a reader of messages. It begins at the first call of [`Tap::poll`], and ends when it is dropped.
     fn tap(&self) -> Box<dyn Tap>;
+
+    /// Returns a reader of channels and views, for Foxglove. It begins at the first call of [`Live::poll`], and ends
+    /// when it is dropped.
+    fn live(&self) -> Box<dyn Live>;
 }
 
 /// The parameters of an application.
@@ -98,6 +105,68 @@ pub struct Sighting<'m> {
     pub payload: &'m [u8],
 }
 
+/// Finds the channels that recordings of the system would have, and reads views of their messages. No sender waits for
+/// it. A node copies messages for it only while one of their topics is wanted.
+///
+/// # Examples
+///
+/// ```
+/// use std::collections::BTreeSet;
+///
+/// use sinew_view::{LiveItem, NoSystem, Source};
+///
+/// let mut live = NoSystem.live();
+/// let wanted = BTreeSet::from(["/knee.sensor/leg.angle/view".to_owned()]);
+/// let faults = live.poll(&wanted, &mut |item| match item {
+///     LiveItem::Channel(channel) => println!("{} is a channel", channel.topic),
+///     LiveItem::Message { topic, data, .. } => println!("{topic}: {} bytes", data.len()),
+///     LiveItem::Missed(count) => println!("{count} messages are missing"),
+/// });
+/// assert!(faults.is_empty());
+/// ```
+pub trait Live: Send {
+    /// Hands over the channels that are new or have another schema, and the views of wanted topics, since the last
+    /// call. It lasts some milliseconds, and longer where it asks nodes, each with a time limit.
+    ///
+    /// Returns why messages of a node cannot be read, for each such node.
+    fn poll(&mut self, wanted: &BTreeSet<String>, take: &mut dyn FnMut(LiveItem<'_>)) -> Vec<String>;
+}
+
+/// A part of the stream of a [`Live`].
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum LiveItem<'m> {
+    /// A channel, before its first message.
+    Channel(LiveChannel),
+    /// A view.
+    Message {
+        /// The topic of its channel.
+        topic: &'m str,
+        /// When the node handed over the message, in nanoseconds of the wall clock.
+        time_ns: u64,
+        /// The view, as a recording has it.
+        data: &'m [u8],
+    },
+    /// So many messages of wanted topics were not read in time.
+    Missed(u64),
+}
+
+/// A channel of views, as a recording has it.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct LiveChannel {
+    /// The topic, such as `/knee.sensor/leg.angle/view`.
+    pub topic: String,
+    /// The encoding of the messages: `protobuf` or `json`.
+    pub encoding: String,
+    /// The name of the schema.
+    pub schema_name: String,
+    /// The encoding of the schema: `protobuf` (a `FileDescriptorSet`) or `jsonschema`.
+    pub schema_encoding: String,
+    /// The schema.
+    pub schema: Vec<u8>,
+    /// The metadata that a recording has of it.
+    pub metadata: BTreeMap<String, String>,
+}
+
 /// A system of which nothing is known, for tests and examples.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct NoSystem;
@@ -122,10 +191,20 @@ impl Source for NoSystem {
     fn tap(&self) -> Box<dyn Tap> {
         Box::new(Self)
     }
+
+    fn live(&self) -> Box<dyn Live> {
+        Box::new(Self)
+    }
 }
 
 impl Tap for NoSystem {
     fn poll(&mut self, _: &BTreeSet<String>, _: &mut dyn FnMut(&Sighting<'_>)) -> Vec<String> {
+        Vec::new()
+    }
+}
+
+impl Live for NoSystem {
+    fn poll(&mut self, _: &BTreeSet<String>, _: &mut dyn FnMut(LiveItem<'_>)) -> Vec<String> {
         Vec::new()
     }
 }

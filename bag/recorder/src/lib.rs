@@ -12,6 +12,7 @@
 //! - [`Recorder`] takes a reader of the journal and a writer of the file. Its owner calls [`Recorder::pump`] every few
 //!   milliseconds. It knows no node, no socket and no clock: names and times are arguments.
 //! - [`Follower`] hands over the messages of a node as they pass, for programs that show them.
+//! - [`LiveViews`] hands over the same channels and views as a recording has, as they come and without a file.
 //! - [`FrozenRing`] is a journal that nothing writes any more: a frozen span, or the ring of a dead node.
 
 mod channels;
@@ -20,6 +21,7 @@ mod facts;
 mod file_name;
 mod follower;
 mod frozen;
+mod live;
 mod names;
 mod order;
 mod recorder;
@@ -34,13 +36,14 @@ mod tests;
 pub use error::RecordingError;
 pub use follower::{Follower, Seen};
 pub use frozen::{FrozenFile, FrozenRing, RingOrigin};
+pub use live::LiveViews;
 pub use names::Names;
 pub use order::WINDOW;
 pub use recorder::Recorder;
 pub use recording::Recording;
 pub use session::{Connection, End, RecordingOptions, Session, Summary};
 pub use setup::Setup;
-pub use sinew_bag::{BagError, Compression, Options as FileOptions, Totals};
+pub use sinew_bag::{BagError, Compression, Options as FileOptions, Totals, ViewChannel, ViewItem};
 pub use sinew_record::{
     Selection,
     files::{Owners, is_own, read_facts},

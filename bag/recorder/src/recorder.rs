@@ -1,5 +1,7 @@
 //! Reads the journal, and writes the file.
 
+mod state;
+
 use std::{
     collections::{BTreeMap, BTreeSet},
     time::Duration,
@@ -11,7 +13,7 @@ use sinew_runtime::{
     tid::{AppAddress, NodeAddress, Tid},
     wire::Kind,
 };
-use sinew_shm::journal::{self, JournalReader, ReadJournalError, ReaderCounts};
+use sinew_shm::journal::{self, JournalReader, ReadJournalError};
 
 use crate::{
     channels::{Description, Held, Place, Recorded, is_unreported, record},
@@ -103,17 +105,21 @@ impl Recorder {
     ///
     /// # Errors
     /// The journal cannot be read.
-    pub fn begin(mut reader: JournalReader, bag: BagWriter, setup: Setup) -> Result<Self, ReadJournalError> {
+    pub fn begin(reader: JournalReader, bag: BagWriter, setup: Setup) -> Result<Self, ReadJournalError> {
+        Self::begin_with(reader, Sink::new(bag), setup)
+    }
+
+    fn begin_with(mut reader: JournalReader, sink: Sink, setup: Setup) -> Result<Self, ReadJournalError> {
         reader.set_patience(PATIENCE);
         // A message with a higher number is written to the ring later than this, and so is read.
         let before = seen(&reader.channels()?);
-        Ok(Self::new(reader, bag, setup, before))
+        Ok(Self::new(reader, sink, setup, before))
     }
 
-    const fn new(reader: JournalReader, bag: BagWriter, setup: Setup, before: BTreeMap<u16, u64>) -> Self {
+    const fn new(reader: JournalReader, sink: Sink, setup: Setup, before: BTreeMap<u16, u64>) -> Self {
         Self {
             reader,
-            sink: Sink::new(bag),
+            sink,
             setup,
             before,
             until: None,
@@ -157,7 +163,7 @@ impl Recorder {
     pub fn of_span(mut reader: JournalReader, bag: BagWriter, setup: Setup, span: &Span) -> Self {
         // No writer finishes a record any more.
         reader.set_patience(Duration::ZERO);
-        Self { until: Some(span.until()), ..Self::new(reader, bag, setup, span.before()) }
+        Self { until: Some(span.until()), ..Self::new(reader, Sink::new(bag), setup, span.before()) }
     }
 
     /// Writes the records that are there, at most 4,096, and each second the counters. Returns whether there are no
@@ -251,44 +257,6 @@ impl Recorder {
     /// Writes the clocks of other nodes. Those in the journal are written by [`pump`](Self::pump).
     pub fn clocks(&mut self, now_ns: u64, peers: &[PeerClock]) {
         facts::clocks(&mut self.sink, now_ns, peers, &self.setup.names);
-    }
-
-    /// Returns the oldest fault of the file since the last call. Its messages are counted as dropped, and a new part of
-    /// the file is tried once a second.
-    pub const fn take_fault(&mut self) -> Option<BagError> {
-        self.sink.take_fault()
-    }
-
-    /// Returns whether the file has its maximum size. Further messages are counted as dropped.
-    #[must_use]
-    pub const fn is_full(&self) -> bool {
-        self.sink.is_full()
-    }
-
-    /// Returns the counters so far.
-    #[must_use]
-    pub fn totals(&self) -> Totals {
-        self.sink.totals()
-    }
-
-    /// Returns the events that cost the reader records.
-    #[must_use]
-    pub const fn counts(&self) -> ReaderCounts {
-        self.reader.counts()
-    }
-
-    /// Returns whether the node is alive and still writes this journal.
-    #[must_use]
-    pub fn is_writer_alive(&self) -> bool {
-        self.reader.is_writer_alive()
-    }
-
-    /// Returns whether the node has ended the journal in order, which a killed one does not.
-    ///
-    /// # Errors
-    /// The journal cannot be read.
-    pub fn is_closed(&self) -> Result<bool, ReadJournalError> {
-        self.reader.is_closed()
     }
 
     fn before(&self, place: u16) -> u64 {

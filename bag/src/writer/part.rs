@@ -14,14 +14,8 @@ use std::{
 
 use mcap::{McapError, WriteOptions, records::MessageHeader, write::NoSeek};
 
-use super::{
-    channel::{Channel, View},
-    records::Fixed,
-};
-use crate::{
-    terms::{Compression, Options, Origin},
-    view,
-};
+use super::{channel::Channel, records::Fixed};
+use crate::terms::{Compression, Options, Origin};
 
 /// The name of the metadata record of each part.
 pub(crate) const METADATA: &str = "sinew";
@@ -178,11 +172,7 @@ impl Part {
         let Channel { topic, metadata, companion, .. } = channel;
         let [own, beside] = [&*metadata, &companion.metadata].map(|own| with(own, &self.recorder));
         let raw = self.mcap.add_channel(0, topic, "msgpack", &own).map_err(cause)?;
-        let (name, encoding, data) = match &companion.view {
-            View::Typed(plan) => (plan.name(), "protobuf", plan.descriptor()),
-            View::Header => (view::HEADER_TYPE.to_owned(), "protobuf", view::header_descriptor()),
-            View::Json => ("sinew.json".to_owned(), "jsonschema", br#"{"type":"object"}"#.to_vec()),
-        };
+        let (name, encoding, data) = companion.schema();
         let schema = self.mcap.add_schema(&name, encoding, &data).map_err(cause)?;
         self.described +=
             (2 * topic.len() + text(&own) + text(&beside) + name.len() + data.len() + 150) as u64;

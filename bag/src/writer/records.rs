@@ -48,6 +48,12 @@ const fn log(topic: EventTopic) -> Fixed {
     Fixed { topic: topic.topic(), schema: "foxglove.Log", json_schema: LOG }
 }
 
+/// Returns every channel that a recording has besides those of messages.
+pub(super) fn all() -> impl Iterator<Item = &'static Fixed> {
+    static TALLY_AND_CLOCK: [Fixed; 2] = [TALLY, CLOCK];
+    TALLY_AND_CLOCK.iter().chain(&EVENTS)
+}
+
 pub(super) fn of_topic(topic: EventTopic) -> &'static Fixed {
     match topic {
         EventTopic::Events => &EVENTS[0],
@@ -63,7 +69,12 @@ pub(super) fn gap<'e>(text: &'e str, data: &'e serde_json::Value, at_ns: u64) ->
 }
 
 /// Returns a tally: of all channels if `is_whole`, else of those with other counters than in the tally before.
-pub(super) fn tally(channels: &mut [Channel], part: u32, events_lost: u64, is_whole: bool) -> String {
+pub(super) fn tally<'c>(
+    channels: impl IntoIterator<Item = &'c mut Channel>,
+    part: u32,
+    events_lost: u64,
+    is_whole: bool,
+) -> String {
     let mut named = Vec::new();
     for channel in channels {
         if is_whole || channel.tallied != Some(channel.counts) {

@@ -2,8 +2,8 @@ use std::{fs, io, os::unix::fs::PermissionsExt as _, time::Duration};
 
 use super::*;
 use crate::{
-    terms::{Compression, Direction, EventTopic, Level},
-    testing::{TestFolder, angle, record},
+    terms::{Class, Compression, Direction, EventTopic, Level},
+    testing::{TestFolder, angle, record, with_info},
 };
 
 fn origin() -> Origin {
@@ -252,4 +252,90 @@ fn view_of_a_protected_payload_shows_the_value_inside() {
     assert_eq!(&*found[0].data, &*sealed, "the payload stays as it was sent");
     let view: serde_json::Value = serde_json::from_slice(&found[1].data).unwrap();
     assert_eq!(view["x"], 5);
+}
+
+/// Same as [`angle`], for views without a file.
+fn viewed_angle(views: &mut ViewWriter) -> ChannelId {
+    with_info(Class::Stream, Direction::Sent, "exo.angle", |info| views.channel(info)).unwrap()
+}
+
+#[test]
+fn views_without_a_file_are_those_of_the_file() {
+    // Given: the same messages for a file and for a stream of views
+    let folder = TestFolder::new();
+    let file = folder.path("walk.mcap");
+    let mut bag = BagWriter::create(&file, Options::default(), origin()).unwrap();
+    let mut views = ViewWriter::new(origin());
+    views.want(&BTreeSet::from(["/knee.sensor/exo.angle/view".to_owned()]));
+    let in_bag = angle(&mut bag, Direction::Sent);
+    let in_views = viewed_angle(&mut views);
+    for number in 1..=3 {
+        let record = record(number, number * SECOND);
+        bag.message(in_bag, &record).unwrap();
+        views.message(in_views, &record);
+    }
+    bag.finish(4 * SECOND).unwrap();
+    // When
+    let items = views.take();
+    // Then
+    let bytes = fs::read(&file).unwrap();
+    let written: Vec<_> = mcap::MessageStream::new(&bytes)
+        .unwrap()
+        .map(Result::unwrap)
+        .filter(|message| message.channel.topic == "/knee.sensor/exo.angle/view")
+        .collect();
+    let ViewItem::Channel(channel) = &items[0] else { panic!("{items:?}") };
+    let schema = written[0].channel.schema.as_ref().unwrap();
+    assert_eq!(channel.encoding, written[0].channel.message_encoding);
+    assert_eq!((&channel.schema_name, channel.schema_encoding), (&schema.name, schema.encoding.as_str()));
+    assert_eq!(channel.schema, &*schema.data);
+    for (key, value) in &written[0].channel.metadata {
+        assert_eq!(channel.metadata.get(key), Some(value), "{key}");
+    }
+    assert_eq!(channel.metadata["sinew.source_name"], "knee.sensor");
+    let streamed = items[1..].iter().map(|item| match item {
+        ViewItem::Message { topic, time_ns, data } => (topic.to_string(), *time_ns, data.clone()),
+        ViewItem::Channel(_) | ViewItem::Missed { .. } => panic!("{item:?}"),
+    });
+    let filed = written
+        .iter()
+        .map(|message| (message.channel.topic.clone(), message.log_time, message.data.to_vec()));
+    assert_eq!(streamed.collect::<Vec<_>>(), filed.collect::<Vec<_>>());
+    assert!(views.take().is_empty());
+}
+
+#[test]
+fn unwanted_messages_are_counted_and_not_encoded() {
+    let mut views = ViewWriter::new(origin());
+    let channel = viewed_angle(&mut views);
+    views.message(channel, &record(1, SECOND));
+    views.dropped(channel, 2, (SECOND, SECOND));
+    assert_eq!(views.take().len(), 1, "the channel alone");
+    views.want(&BTreeSet::from([TALLY_TOPIC.to_owned(), "/knee.sensor/exo.angle/view".to_owned()]));
+    views.message(channel, &record(4, SECOND));
+    views.dropped(channel, 1, (SECOND, SECOND));
+    views.tally(SECOND);
+    let items = views.take();
+    let [ViewItem::Message { .. }, ViewItem::Missed { count: 1, .. }, ViewItem::Message { topic, data, .. }] =
+        &items[..]
+    else {
+        panic!("{items:?}")
+    };
+    let tally: serde_json::Value = serde_json::from_slice(data).unwrap();
+    assert_eq!(&**topic, TALLY_TOPIC);
+    let counts = &tally["channels"][0];
+    assert_eq!((&counts["seen"], &counts["written"], &counts["dropped"]), (&5.into(), &2.into(), &3.into()));
+}
+
+#[test]
+fn expected_channel_is_the_one_that_comes() {
+    let mut views = ViewWriter::new(origin());
+    let expected = with_info(Class::Stream, Direction::Sent, "exo.angle", ViewWriter::expected);
+    viewed_angle(&mut views);
+    let items = views.take();
+    let [ViewItem::Channel(found)] = &items[..] else { panic!("{items:?}") };
+    assert_eq!((&found.topic, &found.schema), (&expected.topic, &expected.schema));
+    let fixed: Vec<_> = ViewWriter::fixed_channels().into_iter().map(|channel| channel.topic).collect();
+    assert_eq!(fixed.len(), 6);
+    assert!(fixed.iter().all(|topic| topic.starts_with("/sinew/")), "{fixed:?}");
 }

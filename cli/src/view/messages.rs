@@ -30,7 +30,7 @@ const WATCHED_EVERY: Duration = Duration::from_millis(50);
 /// Questions to such a node in a row, while it has more.
 const WATCHED_MAX: usize = 8;
 /// Time limit for each question: meanwhile nothing else is read.
-const ASKED_WITHIN: Duration = Duration::from_millis(500);
+pub(super) const ASKED_WITHIN: Duration = Duration::from_millis(500);
 
 /// Reads messages, with the connections that this takes.
 pub(super) struct Messages {
@@ -56,9 +56,16 @@ pub(super) struct Messages {
 }
 
 /// The connection to a node of this host.
-struct Own {
+pub(super) struct Own {
     system: System,
     entry: Arc<Entry>,
+}
+
+impl Own {
+    /// Takes a connection with addresses that the entry knows.
+    pub(super) const fn new(system: System, entry: Arc<Entry>) -> Self {
+        Self { system, entry }
+    }
 }
 
 impl Drop for Own {
@@ -170,7 +177,7 @@ impl Messages {
         } else {
             param::enter_node(system, node).inspect(|own| self.entry.add(own))
         };
-        let journal = own.map(|system| Own { system, entry: Arc::clone(&self.entry) });
+        let journal = own.map(|system| Own::new(system, Arc::clone(&self.entry)));
         match journal.and_then(|own| Follower::begin(own, selection).ok()) {
             Some(journal) => drop(self.journals.insert(node, journal)),
             None => drop(self.others.insert(node)),

@@ -5,6 +5,7 @@ mod bag;
 mod contracts;
 mod doctor;
 mod fault;
+mod foxglove;
 mod keys;
 mod logs;
 mod mistakes;

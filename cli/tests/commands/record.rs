@@ -15,7 +15,7 @@ use sinew_testkit::{NodeProcess, TestDirectory, program, until};
 
 use crate::scenario::{Answer, Scenario};
 
-payload!("scenario.count", Bulk => struct Count { number: u64 });
+payload!("scenario.count", Bulk => pub(crate) struct Count { pub(crate) number: u64 });
 
 /// Ends the traffic when it is dropped.
 struct End<'a>(&'a AtomicBool);

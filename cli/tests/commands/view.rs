@@ -20,6 +20,8 @@ pub(crate) struct View {
     pub(crate) address: SocketAddr,
     /// The path of the page, with the token.
     pub(crate) page: String,
+    /// The address for Foxglove, with its token; empty without `--foxglove`.
+    pub(crate) foxglove: String,
 }
 
 /// An answer over HTTP.
@@ -31,15 +33,21 @@ pub(crate) struct HttpAnswer {
 
 impl View {
     pub(crate) fn of(scenario: &Scenario, node: &str) -> Self {
+        Self::with(scenario, node, &[])
+    }
+
+    /// Same as `of`, with these further words.
+    pub(crate) fn with(scenario: &Scenario, node: &str, more: &[&str]) -> Self {
         let mut command = Command::new(env!("CARGO_BIN_EXE_sinew"));
         command.arg("--socket").arg(scenario.socket(node)).arg("--json");
-        command.args(["view", "--listen", "127.0.0.1:0"]);
+        command.args(["view", "--listen", "127.0.0.1:0"]).args(more);
         let mut process = NodeProcess::start("sinew view", command);
         let line: Value = serde_json::from_str(&process.wait_for(&["listens"])).expect("JSON");
         let address = line["listens"].as_str().expect("a text").parse().expect("an address");
         let page = line["page"].as_str().expect("a text");
         let page = page.strip_prefix(&format!("http://{address}")).expect("it is of this server").to_owned();
-        Self { process, address, page }
+        let foxglove = line["foxglove"].as_str().unwrap_or_default().to_owned();
+        Self { process, address, page, foxglove }
     }
 
     pub(crate) fn connect(&self) -> TcpStream {
@@ -67,7 +75,7 @@ impl View {
         self.send(request.as_bytes()).expect("a valid request has an answer")
     }
 
-    fn metrics(&self) -> Metrics {
+    pub(crate) fn metrics(&self) -> Metrics {
         let answer = self.get("/metrics", "");
         assert_eq!(answer.status, 200, "{}{}", answer.head, answer.body);
         Metrics::parse(&answer.body)
@@ -80,7 +88,7 @@ impl View {
 }
 
 /// The samples of a scrape: the value of each name with its labels.
-struct Metrics(BTreeMap<String, f64>);
+pub(crate) struct Metrics(BTreeMap<String, f64>);
 
 impl Metrics {
     fn parse(text: &str) -> Self {
@@ -96,7 +104,7 @@ impl Metrics {
         Self(by_name)
     }
 
-    fn value(&self, sample: &str) -> Option<f64> {
+    pub(crate) fn value(&self, sample: &str) -> Option<f64> {
         self.0.get(sample).copied()
     }
 
@@ -106,7 +114,7 @@ impl Metrics {
 }
 
 /// Returns the delivered and refused messages of the mailboxes of the node's application of the same name, by class.
-fn mailboxes(audit: &Value, node: &str) -> BTreeMap<String, [f64; 2]> {
+pub(crate) fn mailboxes(audit: &Value, node: &str) -> BTreeMap<String, [f64; 2]> {
     let app = node;
     let node = named(&audit["nodes"], node).unwrap_or_else(|| panic!("no {node}: {audit}"));
     let entries = node["entries"].as_array().expect("a list").iter();

@@ -20,6 +20,7 @@ use sinew::Time;
 use self::samples::Samples;
 pub use self::table::{METRICS, Metric, Shape};
 use crate::{
+    foxglove::Counts,
     nodes::{NodeLabels, NodeRow},
     snapshot::Snapshot,
 };
@@ -42,10 +43,15 @@ impl Format {
     }
 }
 
-/// Returns all metrics of a snapshot as text.
-pub(crate) fn encode(snapshot: &Snapshot, now: Time, format: Format) -> Result<String, fmt::Error> {
+/// Returns all metrics of a snapshot as text, and those of the server for Foxglove, if there is one.
+pub(crate) fn encode(
+    snapshot: &Snapshot,
+    foxglove: Option<Counts>,
+    now: Time,
+    format: Format,
+) -> Result<String, fmt::Error> {
     let mut registry = Registry::with_prefix(table::PREFIX);
-    registry.register_collector(Box::new(samples(snapshot, now)));
+    registry.register_collector(Box::new(samples(snapshot, foxglove, now)));
     let mut encoded = String::new();
     match format {
         Format::OpenMetrics => text::encode(&mut encoded, &registry)?,
@@ -54,11 +60,14 @@ pub(crate) fn encode(snapshot: &Snapshot, now: Time, format: Format) -> Result<S
     Ok(encoded)
 }
 
-fn samples(snapshot: &Snapshot, now: Time) -> Samples {
+fn samples(snapshot: &Snapshot, foxglove: Option<Counts>, now: Time) -> Samples {
     let labels = NodeLabels::of(snapshot);
     let rows: Vec<NodeRow> = crate::nodes::rows(snapshot, &labels);
     let mut samples = Samples::default();
     system::add(&mut samples, snapshot, &rows, now);
+    if let Some(counts) = foxglove {
+        system::add_foxglove(&mut samples, counts);
+    }
     for answers in snapshot.answers() {
         let node = labels.get(answers.node.node);
         system::add_node(&mut samples, answers, &node);

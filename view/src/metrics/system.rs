@@ -5,12 +5,13 @@ use sinew::{Time, stop::StopState};
 use super::{
     samples::Samples,
     table::{
-        AGE, ENTRY_UP, LEFT_OUT, NODE_FIFO, NODE_IDLE_CLIENTS, NODE_LATENESS, NODE_LOST, NODE_STALL_LONGEST,
-        NODE_STALLS, NODE_STOPPED, NODE_STOPPING, NODE_TROUBLED, NODE_UP, NODE_UPTIME, RECORDER_DROPPED,
-        RECORDER_SEEN, REFUSED, TOOK,
+        AGE, ENTRY_UP, FOXGLOVE_CLIENTS, FOXGLOVE_DROPPED, FOXGLOVE_MESSAGES, LEFT_OUT, NODE_FIFO,
+        NODE_IDLE_CLIENTS, NODE_LATENESS, NODE_LOST, NODE_STALL_LONGEST, NODE_STALLS, NODE_STOPPED,
+        NODE_STOPPING, NODE_TROUBLED, NODE_UP, NODE_UPTIME, RECORDER_DROPPED, RECORDER_SEEN, REFUSED, TOOK,
     },
 };
 use crate::{
+    foxglove::Counts,
     nodes::{NodeRow, State, bounded},
     snapshot::{Answers, Snapshot},
 };
@@ -26,6 +27,15 @@ pub(super) fn truth(is_so: bool) -> f64 {
 /// Returns microseconds as seconds.
 pub(super) fn micros(micros: u64) -> f64 {
     micros as f64 / 1e6
+}
+
+/// Adds the counters of the server for Foxglove.
+pub(super) fn add_foxglove(samples: &mut Samples, counts: Counts) {
+    let Counts { clients, queued, dropped, missed } = counts;
+    samples.level(&FOXGLOVE_CLIENTS, [], clients as f64);
+    samples.count(&FOXGLOVE_MESSAGES, [], queued);
+    samples.count(&FOXGLOVE_DROPPED, ["client"], dropped);
+    samples.count(&FOXGLOVE_DROPPED, ["journal"], missed);
 }
 
 /// Adds the state of the snapshot and of each node of the system.

@@ -74,6 +74,16 @@ pub(super) const SAMPLES_LEFT_OUT: Metric =
 pub(super) const LEFT_OUT: Metric =
     gauge("left_out", WHY, "Entries that had no room in the answers of a node, by the kind of entry.");
 
+pub(super) const FOXGLOVE_CLIENTS: Metric =
+    gauge("foxglove_clients", &[], "Clients of the server for Foxglove, with --foxglove.");
+pub(super) const FOXGLOVE_MESSAGES: Metric =
+    counter("foxglove_messages", &[], "Messages that were queued for clients of Foxglove.");
+pub(super) const FOXGLOVE_DROPPED: Metric = counter(
+    "foxglove_dropped",
+    &["why"],
+    "Messages that clients of Foxglove did not get: client read too slowly, or journal was not read in time.",
+);
+
 pub(super) const NODE_UP: Metric = gauge("node_up", NODE, "Whether the node answers.");
 pub(super) const NODE_LOST: Metric =
     gauge("node_lost", WHY, "1 for each lost node that has not returned, with the class of its loss.");
@@ -202,6 +212,9 @@ pub const METRICS: &[Metric] = &[
     TOOK,
     SAMPLES_LEFT_OUT,
     LEFT_OUT,
+    FOXGLOVE_CLIENTS,
+    FOXGLOVE_MESSAGES,
+    FOXGLOVE_DROPPED,
     NODE_UP,
     NODE_LOST,
     NODE_STOPPING,

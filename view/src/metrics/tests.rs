@@ -19,7 +19,10 @@ use sinew::{
 };
 
 use super::{Format, METRICS, Shape, encode};
-use crate::snapshot::{Answers, NodeAnswers, Snapshot};
+use crate::{
+    foxglove::Counts,
+    snapshot::{Answers, NodeAnswers, Snapshot},
+};
 
 const TAKEN: Time = Time::from_nanos(5_000_000_000);
 const NOW: Time = Time::from_nanos(5_500_000_000);
@@ -257,8 +260,11 @@ fn audit(of: &NodeReport) -> NodeAudit {
     }
 }
 
+/// Counters of a server for Foxglove.
+const FOXGLOVE: Counts = Counts { clients: 2, queued: 30, dropped: 4, missed: 5 };
+
 fn text(snapshot: &Snapshot) -> String {
-    encode(snapshot, NOW, Format::OpenMetrics).expect("it is written to memory")
+    encode(snapshot, Some(FOXGLOVE), NOW, Format::OpenMetrics).expect("it is written to memory")
 }
 
 /// Returns the sample of this line up to its value, or fails.
@@ -271,7 +277,7 @@ fn value(text: &str, sample: &str) -> f64 {
 #[test]
 fn each_metric_has_its_own_labels_in_both_formats() {
     for format in [Format::OpenMetrics, Format::PlainText] {
-        let text = encode(&snapshot(), NOW, format).expect("it is written to memory");
+        let text = encode(&snapshot(), Some(FOXGLOVE), NOW, format).expect("it is written to memory");
         for metric in METRICS {
             let name = metric.full_name();
             let line = text.lines().find(|line| line.split(['{', ' ']).next() == Some(&name));
@@ -322,11 +328,21 @@ fn samples_have_base_units_and_the_names_of_nodes() {
         ("sinew_guard_safe{node=\"hip\",app=\"drive\"}", 1.0),
         ("sinew_guard_safe_cause{node=\"hip\",app=\"drive\",why=\"Silent\"}", 1.0),
         ("sinew_guard_safe_failed{node=\"hip\",app=\"drive\"}", 0.0),
+        ("sinew_foxglove_clients", 2.0),
+        ("sinew_foxglove_messages_total", 30.0),
+        ("sinew_foxglove_dropped_total{why=\"client\"}", 4.0),
+        ("sinew_foxglove_dropped_total{why=\"journal\"}", 5.0),
         ("sinew_refused_total{node=\"hip\",why=\"not taken: NoSuchApplication\"}", 6.0),
     ] {
         let is = value(&text, sample);
         assert!((is - expected).abs() < 1e-12, "{sample}: {is}, not {expected}");
     }
+}
+
+#[test]
+fn server_that_is_off_has_no_samples() {
+    let text = encode(&snapshot(), None, NOW, Format::OpenMetrics).expect("it is written to memory");
+    assert!(!text.contains("sinew_foxglove_clients ") && text.contains("sinew_entry_node_up 1"), "{text}");
 }
 
 #[test]

@@ -1,5 +1,5 @@
 use std::{
-    collections::BTreeMap,
+    collections::{BTreeMap, BTreeSet},
     fs,
     sync::{Arc, Mutex, MutexGuard, PoisonError},
 };
@@ -10,7 +10,7 @@ use sinew_schema::{Field, Schema, Shape};
 use sinew_shm::journal::{Journal, Options};
 
 use super::*;
-use crate::{Follower, Recording};
+use crate::{Follower, LiveViews, Recording, ViewItem};
 
 const NODE: NodeAddress = NodeAddress::new(0x7f00_0002);
 /// The watchdog of a test that waits.
@@ -306,4 +306,59 @@ fn follower_reads_the_journal_that_replaces_a_closed_one() {
     let mut seen = Vec::new();
     follower.poll(&mut |message| seen.push(message.header.sequence)).unwrap();
     assert_eq!(seen, [2]);
+}
+
+#[test]
+fn live_views_have_the_schema_that_the_node_knows() {
+    let node = Node::new("live");
+    let mut live = LiveViews::begin(node.link(), Selection::default(), Selection::default()).unwrap();
+    let [angle, torque] = kinds();
+    let topic = |name: &str| format!("/{}/{name}/view", tid(0x1001));
+    live.want(&BTreeSet::from([topic("test.angle")]));
+    // Given: three messages, of which the node counts one and does not have it any more
+    node.write(angle, 7);
+    node.journal.count(
+        Channel {
+            source: tid(0x1001),
+            destination: tid(0x1002),
+            kind: angle,
+            class: Class::Stream,
+            form: Form::Sent,
+            refused: None,
+        }
+        .key(),
+        1,
+    );
+    node.write(angle, 9);
+    node.write(torque, 10);
+    // When
+    let mut items = Vec::new();
+    // The last one waits for the one before.
+    let until = Time::now() + WATCHDOG;
+    while !items.iter().any(|item| matches!(item, ViewItem::Missed { .. })) {
+        assert!(Time::now() < until, "{items:?}");
+        live.poll(&mut |item| items.push(item)).unwrap();
+    }
+    // Then
+    let channels: Vec<_> = items
+        .iter()
+        .filter_map(|item| match item {
+            ViewItem::Channel(channel) => Some((channel.topic.clone(), channel.encoding)),
+            ViewItem::Message { .. } | ViewItem::Missed { .. } => None,
+        })
+        .collect();
+    assert_eq!(channels, [(topic("test.angle"), "protobuf"), (topic("test.torque"), "json")]);
+    let of_angles = items.iter().filter_map(|item| match item {
+        ViewItem::Message { topic, data, .. } => Some((&**topic == channels[0].0, data[..2].to_vec())),
+        ViewItem::Channel(_) | ViewItem::Missed { .. } => None,
+    });
+    // The field x is 5.
+    assert_eq!(of_angles.collect::<Vec<_>>(), vec![(true, vec![0x08, 5]); 2]);
+    assert!(items.iter().any(|item| matches!(item, ViewItem::Missed { count: 1, .. })), "{items:?}");
+    // And: another selection reaches the node at once, and the recording ends
+    let types = vec!["test.angle".to_owned()];
+    live.select(Selection { types: types.clone(), ..Selection::default() }).unwrap();
+    assert_eq!(lock(&node.asked).last().map(|question| question.selection.types.clone()), Some(types));
+    drop(live.finish());
+    assert!(lock(&node.asked).last().is_some_and(|question| question.ends && question.counts.is_none()));
 }
