@@ -38,8 +38,12 @@ const VIEWS_MAX: usize = 8_192;
 const VIEW_BYTES_MAX: usize = 16 << 20;
 /// Other messages that wait for a client. A client that leaves more unread is closed.
 const CONTROLS_MAX: usize = 256;
-/// Channels in one announcement.
+/// Bytes of the other messages that wait for a client: all channels, with some 8 KiB each.
+const CONTROL_BYTES_MAX: usize = 32 << 20;
+/// Channels in one announcement. All channels are then a quarter of the messages that may wait.
 const ANNOUNCED: usize = 64;
+/// Errors that are reported to a client for one of its messages. Further ones are counted.
+const FAULTS_MAX: usize = 16;
 /// Time between two looks at new messages.
 const PERIOD: Duration = Duration::from_millis(10);
 /// Time between two reports to a client about its dropped messages.
@@ -64,10 +68,8 @@ pub(crate) struct Counts {
 
 /// A client.
 struct Client {
-    controls: Sender<Message>,
-    views: Sender<Message>,
-    /// Bytes in `views`.
-    waiting: Arc<AtomicUsize>,
+    controls: Outbox,
+    views: Outbox,
     /// Has the connection closed.
     cut: Arc<Notify>,
     /// The number of each subscription, by channel.
@@ -81,6 +83,8 @@ struct Client {
 struct State {
     clients: BTreeMap<u64, Client>,
     channels: Channels,
+    /// The channels that no client knows yet.
+    unannounced: Vec<u32>,
     faults: Vec<String>,
     counts: Counts,
     next: u64,
@@ -104,9 +108,59 @@ pub(crate) struct Hub {
 
 /// The queues of a client.
 pub(super) struct Queues {
-    controls: Receiver<Message>,
-    views: Receiver<Message>,
+    controls: Inbox,
+    views: Inbox,
+}
+
+/// The writing end of a queue that is bounded by its messages and their bytes.
+struct Outbox {
+    sender: Sender<Message>,
     waiting: Arc<AtomicUsize>,
+    bytes_max: usize,
+}
+
+/// The reading end of a queue.
+struct Inbox {
+    receiver: Receiver<Message>,
+    /// Bytes of the waiting messages.
+    waiting: Arc<AtomicUsize>,
+}
+
+fn queue(messages_max: usize, bytes_max: usize) -> (Outbox, Inbox) {
+    let (sender, receiver) = channel(messages_max);
+    let waiting = Arc::new(AtomicUsize::new(0));
+    (Outbox { sender, waiting: Arc::clone(&waiting), bytes_max }, Inbox { receiver, waiting })
+}
+
+impl Outbox {
+    /// Queues a message. Returns whether there was room.
+    fn offer(&self, message: Message) -> bool {
+        let bytes = message.len();
+        let has_room = self.waiting.fetch_add(bytes, Ordering::Relaxed) + bytes <= self.bytes_max;
+        let is_queued = has_room && self.sender.try_send(message).is_ok();
+        if !is_queued {
+            self.waiting.fetch_sub(bytes, Ordering::Relaxed);
+        }
+        is_queued
+    }
+}
+
+impl Inbox {
+    async fn next(&mut self) -> Option<Message> {
+        let message = self.receiver.recv().await;
+        self.taken(message)
+    }
+
+    fn try_next(&mut self) -> Option<Message> {
+        let message = self.receiver.try_recv().ok();
+        self.taken(message)
+    }
+
+    fn taken(&self, message: Option<Message>) -> Option<Message> {
+        message.inspect(|message| {
+            self.waiting.fetch_sub(message.len(), Ordering::Relaxed);
+        })
+    }
 }
 
 /// The place of a client, until it is dropped.
@@ -121,44 +175,29 @@ impl Queues {
     pub(super) async fn next(&mut self) -> Option<Message> {
         tokio::select! {
             biased;
-            control = self.controls.recv() => control,
-            view = self.views.recv() => self.taken(view),
+            control = self.controls.next() => control,
+            view = self.views.next() => view,
         }
     }
 
     /// Returns the next message, if there is one now.
     pub(super) fn try_next(&mut self) -> Option<Message> {
-        if let Ok(control) = self.controls.try_recv() {
-            return Some(control);
-        }
-        let view = self.views.try_recv().ok();
-        self.taken(view)
-    }
-
-    fn taken(&self, view: Option<Message>) -> Option<Message> {
-        view.inspect(|view| {
-            self.waiting.fetch_sub(view.len(), Ordering::Relaxed);
-        })
+        self.controls.try_next().or_else(|| self.views.try_next())
     }
 }
 
 impl Client {
     /// Queues a message that is no view. A client without room for it is closed.
     fn control(&self, message: Message) {
-        if self.controls.try_send(message).is_err() {
+        if !self.controls.offer(message) {
             self.cut.notify_one();
         }
     }
 
     /// Queues a view. Returns whether there was room.
     fn view(&mut self, message: Message) -> bool {
-        let bytes = message.len();
-        let has_room = self.waiting.fetch_add(bytes, Ordering::Relaxed) + bytes <= VIEW_BYTES_MAX;
-        let is_queued = has_room && self.views.try_send(message).is_ok();
-        if !is_queued {
-            self.waiting.fetch_sub(bytes, Ordering::Relaxed);
-            self.dropped += 1;
-        }
+        let is_queued = self.views.offer(message);
+        self.dropped += u64::from(!is_queued);
         is_queued
     }
 }
@@ -174,14 +213,8 @@ impl State {
         match item {
             LiveItem::Channel(channel) => match self.channels.put(channel) {
                 Change::None => {}
-                Change::New(new) => self.announce(new),
-                Change::Replaced { former, new } => {
-                    for client in self.clients.values_mut() {
-                        client.subscriptions.remove(&former);
-                        client.control(protocol::unadvertise(former));
-                    }
-                    self.announce(new);
-                }
+                Change::New(new) => self.unannounced.push(new),
+                Change::Replaced { former, new } => self.replace(former, new),
             },
             LiveItem::Message { topic, time_ns, data } => {
                 let Some(number) = self.channels.number(topic) else { return };
@@ -197,10 +230,27 @@ impl State {
         }
     }
 
-    fn announce(&self, number: u32) {
-        let Some(channel) = self.channels.get(number) else { return };
-        for client in self.clients.values() {
-            client.control(protocol::advertise([(number, channel)]));
+    /// Withdraws a channel, if the clients know it, and has its successor announced.
+    fn replace(&mut self, former: u32, new: u32) {
+        if let Some(place) = self.unannounced.iter().position(|number| *number == former) {
+            self.unannounced[place] = new;
+            return;
+        }
+        for client in self.clients.values_mut() {
+            client.subscriptions.remove(&former);
+            client.control(protocol::unadvertise(former));
+        }
+        self.unannounced.push(new);
+    }
+
+    /// Announces the channels that are new since the last call, many in a message: a look finds hundreds.
+    fn announce(&mut self) {
+        for part in std::mem::take(&mut self.unannounced).chunks(ANNOUNCED) {
+            let found = part.iter().filter_map(|number| Some((*number, self.channels.get(*number)?)));
+            let message = protocol::advertise(found);
+            for client in self.clients.values() {
+                client.control(message.clone());
+            }
         }
     }
 
@@ -270,13 +320,14 @@ impl Hub {
         if state.clients.len() >= CLIENTS_MAX {
             return None;
         }
-        let (controls, controls_out) = channel(CONTROLS_MAX);
-        let (views, views_out) = channel(VIEWS_MAX);
-        let (waiting, cut) = (Arc::new(AtomicUsize::new(0)), Arc::new(Notify::new()));
+        // Below the new client gets all channels: it must not get these twice.
+        state.announce();
+        let (controls, controls_out) = queue(CONTROLS_MAX, CONTROL_BYTES_MAX);
+        let (views, views_out) = queue(VIEWS_MAX, VIEW_BYTES_MAX);
+        let cut = Arc::new(Notify::new());
         let client = Client {
             controls,
             views,
-            waiting: Arc::clone(&waiting),
             cut: Arc::clone(&cut),
             subscriptions: BTreeMap::new(),
             dropped: 0,
@@ -291,7 +342,7 @@ impl Hub {
         state.next += 1;
         state.clients.insert(number, client);
         self.shared.changed.notify_all();
-        let queues = Queues { controls: controls_out, views: views_out, waiting };
+        let queues = Queues { controls: controls_out, views: views_out };
         Some((Place { hub: self.clone(), number, cut }, queues))
     }
 }
@@ -304,11 +355,23 @@ impl Place {
         }
     }
 
+    /// Reports these errors to the client.
+    pub(super) fn report(&self, faults: &[String]) {
+        for fault in faults.iter().take(FAULTS_MAX) {
+            self.send(protocol::status(Level::Error, fault, None));
+        }
+        if let Some(more) = faults.len().checked_sub(FAULTS_MAX).filter(|more| *more > 0) {
+            let text = format!("{more} further parts of this request failed; send a shorter one to see why");
+            self.send(protocol::status(Level::Error, &text, None));
+        }
+    }
+
     /// Adds subscriptions, each to a channel that has none.
     pub(super) fn subscribe(&self, subscriptions: &[Subscription]) {
         let mut state = self.hub.shared.lock();
         let State { clients, channels, .. } = &mut *state;
         let Some(client) = clients.get_mut(&self.number) else { return };
+        let mut faults = Vec::new();
         for Subscription { id, channel_id } in subscriptions {
             let fault = if channels.get(*channel_id).is_none() {
                 format!("there is no channel {channel_id}; subscribe to one that was advertised")
@@ -320,8 +383,10 @@ impl Place {
                 client.subscriptions.insert(*channel_id, *id);
                 continue;
             };
-            client.control(protocol::status(Level::Error, &fault, None));
+            faults.push(fault);
         }
+        drop(state);
+        self.report(&faults);
     }
 
     /// Ends these subscriptions.
@@ -370,6 +435,7 @@ fn run(shared: &Shared, source: &dyn Source) {
             let is_broken = polled.is_err();
             {
                 let mut state = shared.lock();
+                state.announce();
                 state.set_faults(polled.unwrap_or_else(|why| vec![why]));
                 if began >= report_due {
                     report_due = began + REPORTED_EVERY;

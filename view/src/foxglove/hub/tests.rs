@@ -26,8 +26,11 @@ fn channel_of(topic: &str, schema: &[u8]) -> LiveItem<'static> {
     LiveItem::Channel(channel)
 }
 
+/// Hands over an item, and ends the look.
 fn take(hub: &Hub, item: LiveItem<'_>) {
-    hub.shared.lock().take(item);
+    let mut state = hub.shared.lock();
+    state.take(item);
+    state.announce();
 }
 
 fn message(data: &[u8]) -> LiveItem<'_> {
@@ -157,16 +160,80 @@ fn clients_have_a_bound_and_give_their_places_back() {
     assert!(hub.connect().is_some());
 }
 
+/// Returns whether the connection of a client is to be closed.
+fn is_cut(place: &Place) -> bool {
+    let runtime = tokio::runtime::Builder::new_current_thread().build().expect("a runtime");
+    runtime.block_on(async {
+        tokio::select! {
+            biased;
+            () = place.cut.notified() => true,
+            () = std::future::ready(()) => false,
+        }
+    })
+}
+
 #[test]
-fn client_that_leaves_announcements_unread_is_closed() {
+fn client_that_leaves_messages_unread_is_closed() {
     let hub = hub();
     let (place, _queues) = hub.connect().expect("there is room");
-    for number in 0..=CONTROLS_MAX {
+    // The first message, which describes the server, waits, too.
+    for number in 1..CONTROLS_MAX {
         take(&hub, channel_of(&format!("/{number}"), b""));
     }
-    let runtime = tokio::runtime::Builder::new_current_thread().enable_time().build().expect("a runtime");
-    let is_cut = runtime.block_on(async { tokio::time::timeout(WATCHDOG, place.cut.notified()).await });
-    assert!(is_cut.is_ok(), "its connection is to be closed");
+    assert!(!is_cut(&place));
+    take(&hub, channel_of("/last", b""));
+    assert!(is_cut(&place));
+    // And: so is one that leaves large ones unread
+    let (place, _queues) = hub.connect().expect("there is room");
+    let large = "x".repeat(CONTROL_BYTES_MAX / 2);
+    place.send(Message::text(large.clone()));
+    assert!(!is_cut(&place));
+    place.send(Message::text(large));
+    assert!(is_cut(&place));
+}
+
+#[test]
+fn channels_of_a_look_are_announced_together() {
+    // Given: more new channels than messages may wait
+    let hub = hub();
+    let (place, mut queues) = hub.connect().expect("there is room");
+    let count = CONTROLS_MAX + 1;
+    for number in 0..count {
+        hub.shared.lock().take(channel_of(&format!("/{number}"), b""));
+    }
+    // When
+    hub.shared.lock().announce();
+    // Then
+    assert!(!is_cut(&place));
+    let announced = |queues: &mut Queues| {
+        let (texts, _) = waiting(queues);
+        let ids = texts.iter().flat_map(|text| text["channels"].as_array().into_iter().flatten());
+        ids.filter_map(|channel| channel["id"].as_u64()).collect::<Vec<_>>()
+    };
+    assert_eq!(announced(&mut queues), (1..=count as u64).collect::<Vec<_>>());
+    // And: one that is replaced before is not announced
+    hub.shared.lock().take(channel_of("/twice", b"1"));
+    take(&hub, channel_of("/twice", b"2"));
+    assert_eq!(announced(&mut queues), [count as u64 + 2]);
+    // And: one that connects in the middle of a look gets each channel once, and so do the others
+    hub.shared.lock().take(channel_of("/late", b""));
+    let (_other, mut of_other) = hub.connect().expect("there is room");
+    hub.shared.lock().announce();
+    assert_eq!(announced(&mut queues), [count as u64 + 3]);
+    assert_eq!(announced(&mut of_other).len(), count + 2);
+}
+
+#[test]
+fn errors_of_one_message_are_few_statuses() {
+    let hub = hub();
+    let (place, mut queues) = hub.connect().expect("there is room");
+    let unknown: Vec<_> = (0..1_000).map(|id| Subscription { id, channel_id: id }).collect();
+    place.subscribe(&unknown);
+    let (texts, _) = waiting(&mut queues);
+    assert_eq!(texts.len(), 1 + FAULTS_MAX + 1);
+    let last = texts.last().and_then(|text| text["message"].as_str()).expect("it has a text");
+    assert!(last.starts_with("984 further"), "{last}");
+    assert!(!is_cut(&place));
 }
 
 /// A system that hands over one channel, and then a message at each look at which its topic is wanted.
