@@ -13,7 +13,7 @@ use futures_util::{
 use hyper::body::Bytes;
 use tokio::{
     io::{AsyncRead, AsyncWrite},
-    sync::Semaphore,
+    task::JoinSet,
     time::{Interval, MissedTickBehavior, interval, sleep, timeout},
 };
 use tokio_tungstenite::{
@@ -38,7 +38,7 @@ const MESSAGE_BYTES_MAX: usize = 256 * 1_024;
 const BUFFER_BYTES: usize = 64 * 1_024;
 /// Messages that are written before the connection is flushed.
 const BATCH: usize = 256;
-/// Time for which a client may read nothing. Then its connection is closed.
+/// Time for which a client may read nothing: a message waits so long for room. Then its connection is closed.
 const STUCK_WITHIN: Duration = Duration::from_secs(5);
 /// Time between two pings.
 const PING_EVERY: Duration = Duration::from_secs(15);
@@ -48,6 +48,10 @@ const SILENT_WITHIN: Duration = Duration::from_secs(45);
 const CLOSED_WITHIN: Duration = Duration::from_secs(1);
 /// Requests for parameters of a client at a time. Further ones are refused.
 const REQUESTS_MAX: usize = 4;
+/// Names of parameters of which a client gets updates.
+const WATCHED_MAX: usize = 4_096;
+/// Bytes of such a name: an application, a dot and a parameter have fewer.
+const WATCHED_BYTES_MAX: usize = 256;
 /// Time between two looks at the values of parameters for a client that wants updates.
 const UPDATED_EVERY: Duration = Duration::from_secs(1);
 
@@ -70,7 +74,7 @@ where
         place: Arc::clone(&place),
         shared,
         writes,
-        requests: Arc::new(Semaphore::new(REQUESTS_MAX)),
+        requests: Mutex::default(),
         watched: Mutex::default(),
     };
     tokio::select! {
@@ -79,6 +83,8 @@ where
         () = session.send_updates() => {}
         () = place.cut.notified() => {}
     }
+    // Its subscriptions end now, and not with its connection.
+    drop((session, place));
     let _ = timeout(CLOSED_WITHIN, sink.close()).await;
 }
 
@@ -101,19 +107,24 @@ where
             next = queues.next() => next,
             _ = pings.tick() => Some(Message::Ping(Bytes::new())),
         };
-        let Some(first) = first else { return };
-        let batch = async {
-            sink.feed(first).await?;
-            for _ in 1..BATCH {
-                let Some(next) = queues.try_next() else { break };
-                sink.feed(next).await?;
+        let mut next = first;
+        for left in (0..BATCH).rev() {
+            let Some(message) = next else { break };
+            if !is_read(sink.feed(message)).await {
+                return;
             }
-            sink.flush().await
-        };
-        if !matches!(timeout(STUCK_WITHIN, batch).await, Ok(Ok(()))) {
+            next = if left > 0 { queues.try_next() } else { None };
+        }
+        if !is_read(sink.flush()).await {
             return;
         }
     }
+}
+
+/// Waits until there is room for a message. Returns `false` if the client has gone or reads nothing. A slow one has the
+/// time for each message, and not for all that wait.
+async fn is_read<E>(written: impl Future<Output = Result<(), E>>) -> bool {
+    matches!(timeout(STUCK_WITHIN, written).await, Ok(Ok(())))
 }
 
 fn pings() -> Interval {
@@ -127,7 +138,9 @@ struct Session {
     place: Arc<Place>,
     shared: Arc<Shared>,
     writes: Writes,
-    requests: Arc<Semaphore>,
+    /// The open requests for parameters. They end with the client, so that none keeps its place. A set that its
+    /// application was asked for is made and logged all the same.
+    requests: Mutex<JoinSet<()>>,
     /// The parameters of which it wants updates.
     watched: Mutex<Watched>,
 }
@@ -142,13 +155,27 @@ enum Watched {
 }
 
 impl Watched {
-    /// Adds names; without any, all.
-    fn add(&mut self, names: Vec<String>) {
-        match self {
-            _ if names.is_empty() => *self = Self::All,
-            Self::All => {}
-            Self::None => *self = Self::These(names.into_iter().collect()),
-            Self::These(known) => known.extend(names),
+    /// Adds names; without any, all. Returns whether there was room for each.
+    fn add(&mut self, names: Vec<String>) -> bool {
+        if names.is_empty() || *self == Self::All {
+            *self = Self::All;
+            return true;
+        }
+        let mut known = self.names();
+        let mut has_room = true;
+        for name in names {
+            let fits = name.len() <= WATCHED_BYTES_MAX && known.len() < WATCHED_MAX;
+            has_room &= known.contains(&name) || (fits && known.insert(name));
+        }
+        *self = Self::These(known);
+        has_room
+    }
+
+    /// Takes the single names.
+    fn names(&mut self) -> BTreeSet<String> {
+        match std::mem::take(self) {
+            Self::None | Self::All => BTreeSet::new(),
+            Self::These(names) => names,
         }
     }
 
@@ -156,7 +183,11 @@ impl Watched {
     fn remove(&mut self, names: &[String]) {
         match self {
             _ if names.is_empty() => *self = Self::None,
-            Self::These(known) => known.retain(|name| !names.contains(name)),
+            Self::These(known) => {
+                for name in names {
+                    known.remove(name);
+                }
+            }
             Self::None | Self::All => {}
         }
     }
@@ -166,7 +197,7 @@ impl Watched {
             Self::None => None,
             Self::All => Some(Wanted::default()),
             Self::These(names) if names.is_empty() => None,
-            Self::These(names) => Some(Wanted::of(names.iter().cloned().collect())),
+            Self::These(names) => Some(Wanted::of(names.clone())),
         }
     }
 }
@@ -197,14 +228,18 @@ impl Session {
                 self.place.unsubscribe(&subscription_ids.into_iter().collect());
             }
             ClientMessage::GetParameters { parameter_names, id } => {
-                self.request(Vec::new(), Wanted::of(parameter_names), id);
+                self.request(Vec::new(), Wanted::of(parameter_names.into_iter().collect()), id);
             }
             ClientMessage::SetParameters { parameters, id } => {
                 let names = parameters.iter().map(|one| one.name.clone()).collect();
                 self.request(parameters, Wanted::of(names), id);
             }
             ClientMessage::SubscribeParameterUpdates { parameter_names } => {
-                self.watched().add(parameter_names);
+                if !self.watched().add(parameter_names) {
+                    self.fault(&format!(
+                        "a client gets updates of at most {WATCHED_MAX} parameters by name; give no name to get all"
+                    ));
+                }
             }
             ClientMessage::UnsubscribeParameterUpdates { parameter_names } => {
                 self.watched().remove(&parameter_names);
@@ -224,16 +259,15 @@ impl Session {
     /// Sets parameters, if there are some and it is allowed, and answers with the values of the wanted ones. Messages
     /// flow meanwhile.
     fn request(&self, given: Vec<GivenParameter>, wanted: Wanted, id: Option<String>) {
-        let Ok(slot) = Arc::clone(&self.requests).try_acquire_owned() else {
+        let mut requests = self.requests.lock().unwrap_or_else(PoisonError::into_inner);
+        while requests.try_join_next().is_some() {}
+        if requests.len() >= REQUESTS_MAX {
             return self.fault("too many requests for parameters are open; wait for their answers");
-        };
+        }
         let (place, shared, writes) = (Arc::clone(&self.place), Arc::clone(&self.shared), self.writes);
-        tokio::spawn(async move {
-            let _slot = slot;
+        requests.spawn(async move {
             let faults = answer(&place, &shared, (&given, writes), (&wanted, id.as_deref())).await;
-            for fault in faults {
-                place.send(protocol::status(Level::Error, &fault, None));
-            }
+            place.report(&faults);
         });
     }
 
@@ -285,7 +319,10 @@ async fn answer(
 
 #[cfg(test)]
 mod tests {
+    use tokio::{io::AsyncReadExt as _, time::Instant};
+
     use super::*;
+    use crate::source::NoSystem;
 
     fn names(names: &[&str]) -> Vec<String> {
         names.iter().map(|name| (*name).to_owned()).collect()
@@ -297,7 +334,7 @@ mod tests {
         assert_eq!(watched.wanted(), None);
         watched.add(names(&["a", "b"]));
         watched.remove(&names(&["a"]));
-        assert_eq!(watched.wanted(), Some(Wanted::of(names(&["b"]))));
+        assert_eq!(watched.wanted(), Some(Wanted::of(BTreeSet::from(["b".to_owned()]))));
         watched.remove(&names(&["b"]));
         assert_eq!(watched.wanted(), None);
         watched.add(names(&[]));
@@ -305,5 +342,77 @@ mod tests {
         assert_eq!(watched.wanted(), Some(Wanted::default()));
         watched.remove(&[]);
         assert_eq!(watched, Watched::None);
+    }
+
+    #[test]
+    fn names_of_updates_have_a_bound() {
+        let mut watched = Watched::default();
+        assert!(!watched.add(vec!["a".repeat(WATCHED_BYTES_MAX + 1)]));
+        assert_eq!(watched.wanted(), None);
+        let all: Vec<_> = (0..WATCHED_MAX).map(|number| number.to_string()).collect();
+        assert!(watched.add(all.clone()) && watched.add(names(&["7"])));
+        assert!(!watched.add(names(&["further"])));
+        assert_eq!(watched.wanted(), Some(Wanted::of(all.into_iter().collect())));
+        assert!(watched.add(names(&[])));
+        assert_eq!(watched, Watched::All);
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn slow_client_is_kept_and_one_that_reads_nothing_is_closed() {
+        const SENT: usize = 100;
+        const BYTES: usize = 16 * 1_024;
+        // Given: a client that reads 40 KiB in a second
+        let (own, mut client) = tokio::io::duplex(4_096);
+        let socket = WebSocketStream::from_raw_socket(own, Role::Server, Some(config())).await;
+        let (mut sink, _source) = socket.split();
+        let hub = Hub::start(Arc::new(NoSystem), "1").expect("a thread");
+        let (place, mut queues) = hub.connect().expect("there is room");
+        let send = || (0..SENT).for_each(|_| place.send(Message::text("x".repeat(BYTES))));
+        send();
+        // When
+        let reading = async {
+            let (mut left, mut bytes) = (SENT * BYTES, [0; 4_096]);
+            while left > 0 {
+                left = left.saturating_sub(client.read(&mut bytes).await.expect("it is open"));
+                sleep(Duration::from_millis(100)).await;
+            }
+        };
+        // Then: it gets all, which takes longer than a client may read nothing
+        let began = Instant::now();
+        tokio::select! {
+            () = write(&mut sink, &mut queues) => panic!("it was closed after {:?}", began.elapsed()),
+            () = reading => {}
+        }
+        assert!(began.elapsed() > 2 * STUCK_WITHIN);
+        // And: now it reads nothing
+        send();
+        let began = Instant::now();
+        write(&mut sink, &mut queues).await;
+        assert!(began.elapsed() >= STUCK_WITHIN);
+        hub.end();
+    }
+
+    #[tokio::test]
+    async fn open_request_ends_with_its_client() {
+        let hub = Hub::start(Arc::new(NoSystem), "1").expect("a thread");
+        let (place, _queues) = hub.connect().expect("there is room");
+        let session = Session {
+            place: Arc::new(place),
+            shared: Shared::without_system(),
+            writes: Writes::Refused,
+            requests: Mutex::default(),
+            watched: Mutex::default(),
+        };
+        for _ in 0..2 * REQUESTS_MAX {
+            session.request(Vec::new(), Wanted::default(), None);
+        }
+        let requests = session.requests.lock().unwrap_or_else(PoisonError::into_inner).len();
+        assert_eq!((requests, hub.counts().clients), (REQUESTS_MAX, 1));
+        // When: the client ends before the answers
+        drop(session);
+        tokio::task::yield_now().await;
+        // Then: no request keeps its place
+        assert_eq!(hub.counts().clients, 0);
+        hub.end();
     }
 }

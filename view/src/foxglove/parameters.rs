@@ -1,7 +1,10 @@
 //! The parameters of all applications, as those of one server: `knee.drive.assistance` is the parameter `assistance` of
 //! `knee.drive`, as on the command line.
 
-use std::{collections::BTreeMap, sync::Arc};
+use std::{
+    collections::{BTreeMap, BTreeSet},
+    sync::Arc,
+};
 
 use serde::Deserialize;
 use serde_json::{Value as Json, json};
@@ -39,16 +42,16 @@ struct ListedApp {
 
 /// The names that a client wants; without any, all.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub(super) struct Wanted(Vec<String>);
+pub(super) struct Wanted(BTreeSet<String>);
 
 impl Wanted {
-    pub(super) const fn of(names: Vec<String>) -> Self {
+    pub(super) const fn of(names: BTreeSet<String>) -> Self {
         Self(names)
     }
 
     /// Returns the values of the wanted parameters. One that is no finite number has none in JSON, and is left out.
     pub(super) fn values(&self, known: &AllKnown) -> BTreeMap<String, Json> {
-        let is_wanted = |name: &String| self.0.is_empty() || self.0.contains(name);
+        let is_wanted = |name: &str| self.0.is_empty() || self.0.contains(name);
         let wanted = known.iter().filter(|(name, _)| is_wanted(name));
         wanted.filter_map(|(name, known)| Some((name.clone(), to_json(known.value)?))).collect()
     }
@@ -166,7 +169,7 @@ mod tests {
         let expected =
             [("hip.on", json!(true)), ("knee.drive.gain", json!(1.0)), ("knee.drive.steps", json!(2))];
         assert_eq!(values, expected.map(|(name, value)| (name.to_owned(), value)).into());
-        let one = Wanted::of(vec!["hip.on".to_owned(), "gone".to_owned()]).values(&all());
+        let one = Wanted::of(["hip.on", "gone"].map(str::to_owned).into()).values(&all());
         assert_eq!(one.keys().collect::<Vec<_>>(), ["hip.on"]);
     }
 
