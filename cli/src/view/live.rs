@@ -61,6 +61,8 @@ pub(super) struct Channels {
     remote: BTreeMap<NodeAddress, (Time, String)>,
     wanted: BTreeSet<String>,
     look_due: Time,
+    /// The last type that the latest look has asked for.
+    last_kind: Option<Kind>,
     faults: Vec<String>,
 }
 
@@ -77,6 +79,7 @@ impl Channels {
             remote: BTreeMap::new(),
             wanted: BTreeSet::new(),
             look_due: Time::now(),
+            last_kind: None,
             faults: Vec::new(),
         }
     }
@@ -124,7 +127,7 @@ impl Channels {
                 format!("{name}: only the messages between it and the nodes here are shown; for the others run sinew view on its host, as its user")
             })
             .collect();
-        Ok(expected::find(system, &here, &self.shown))
+        Ok(expected::find(system, &here, &self.shown, &mut self.last_kind))
     }
 
     /// Returns whether this program can use the socket of a node.

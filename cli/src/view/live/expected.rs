@@ -15,7 +15,7 @@ use sinew_recorder::ViewChannel;
 use super::Origin;
 use crate::system::{System, present};
 
-/// Types that are asked for at one look.
+/// Types that are asked for at one look. The next look begins after them.
 const KINDS_MAX: usize = 256;
 /// Time for the questions about types at one look: meanwhile no message is read.
 const ASKED_WITHIN: Duration = Duration::from_secs(1);
@@ -40,16 +40,25 @@ pub(super) struct Expected {
     pub(super) origin: Origin,
 }
 
-/// Asks the nodes for the types that applications handle, and the entry node for the senders of each. A node without an
-/// answer has no channels until the next look.
-pub(super) fn find(system: &mut System, here: &NodeReport, shown: &Selection) -> Vec<Expected> {
+/// Asks the nodes for the types that applications handle, and the entry node for the senders of each: those after the
+/// type `last`, and sets it. A node without an answer has no channels until the next look.
+pub(super) fn find(
+    system: &mut System,
+    here: &NodeReport,
+    shown: &Selection,
+    last: &mut Option<Kind>,
+) -> Vec<Expected> {
     let until = Time::now() + ASKED_WITHIN;
     let answers = system.ask_these::<AskApps, AppsReport>(present(here));
     let apps = answers.into_iter().filter_map(|answer| answer.result.ok()).flat_map(|report| report.apps);
     let named = apps.flat_map(|app| app.kinds).filter_map(|kind| Some((kind.kind, kind.name?)));
     let kinds: BTreeMap<_, _> = named.filter(|(_, name)| !name.starts_with(OWN_TYPES)).collect();
     let mut all = Vec::new();
-    for (kind, name) in kinds.into_iter().take(KINDS_MAX) {
+    for kind in next_kinds(&kinds, *last) {
+        if Time::now() >= until {
+            break;
+        }
+        *last = Some(kind);
         let Some(mut report) = ask(system, here.node, kind, until) else { continue };
         for one in report.schemas.iter_mut().filter(|one| one.schema.is_none()) {
             // The node of a sender has its structure.
@@ -58,9 +67,15 @@ pub(super) fn find(system: &mut System, here: &NodeReport, shown: &Selection) ->
             one.schema =
                 other.schemas.into_iter().find(|found| found.hash == one.hash).and_then(|found| found.schema);
         }
-        all.extend(channels(&report, kind, &name, shown));
+        all.extend(channels(&report, kind, &kinds[&kind], shown));
     }
     all
+}
+
+/// Returns the types of a look: those after the last one of the look before, and then from the first one on.
+fn next_kinds(kinds: &BTreeMap<Kind, String>, last: Option<Kind>) -> Vec<Kind> {
+    let (before, after): (Vec<_>, Vec<_>) = kinds.keys().copied().partition(|kind| Some(*kind) <= last);
+    after.into_iter().chain(before).take(KINDS_MAX).collect()
 }
 
 /// Asks a node for the structures of a type, if there is time left.
@@ -153,6 +168,20 @@ mod tests {
         assert_eq!(topics(&["hip"]), ["/hip/exo.angle/view"]);
         assert_eq!(topics(&["knee"]).len(), 2, "it receives from both");
         assert!(topics(&["arm"]).is_empty());
+    }
+
+    #[test]
+    fn looks_ask_for_all_types_in_turn() {
+        let count = KINDS_MAX as u32 + 2;
+        let kinds: BTreeMap<_, _> = (0..count).map(|bits| (Kind::from_bits(bits), String::new())).collect();
+        let first = next_kinds(&kinds, None);
+        assert_eq!((first.len(), first[0]), (KINDS_MAX, Kind::from_bits(0)));
+        let second = next_kinds(&kinds, first.last().copied());
+        assert_eq!(second[..3], [count - 2, count - 1, 0].map(Kind::from_bits));
+        assert_eq!(second.len(), KINDS_MAX);
+        // And: few types are all asked for at each look
+        let few: BTreeMap<_, _> = (0..3).map(|bits| (Kind::from_bits(bits), String::new())).collect();
+        assert_eq!(next_kinds(&few, Some(Kind::from_bits(2))), [0, 1, 2].map(Kind::from_bits));
     }
 
     #[test]
