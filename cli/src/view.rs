@@ -25,7 +25,7 @@ use sinew::{
     stop::StopReport,
 };
 use sinew_view::{
-    AppParameters, Live, NODES_MAX, NodeAnswers, Server, Snapshot, Source, StopAct, Tap, Writes,
+    AppParameters, Live, NODES_MAX, NodeAnswers, Reads, Server, Snapshot, Source, StopAct, Tap, Writes,
 };
 
 use crate::{
@@ -55,6 +55,10 @@ pub(crate) struct Order {
     /// Offers Foxglove only messages from or to applications of this name, with `*` for any text; may be repeated
     #[arg(long = "foxglove-app", value_name = "NAME", requires = "foxglove")]
     foxglove_apps: Vec<String>,
+    /// Lets programs of this host read without the token, for clients that take none, such as PlotJuggler. Pages of
+    /// browsers need it, and so do sets
+    #[arg(long, requires = "foxglove")]
+    foxglove_open: bool,
     /// Lets Foxglove set parameters, as far as the nodes let this command
     #[arg(long, requires = "foxglove")]
     foxglove_writes: bool,
@@ -65,7 +69,8 @@ impl Order {
     fn bind_foxglove(&self, server: &mut Server) -> Result<Option<String>, SystemError> {
         let Some(port) = self.foxglove else { return Ok(None) };
         let writes = if self.foxglove_writes { Writes::Allowed } else { Writes::Refused };
-        let bound = server.bind_foxglove(port, writes).map_err(|why| {
+        let reads = if self.foxglove_open { Reads::OnThisHost } else { Reads::WithToken };
+        let bound = server.bind_foxglove(port, reads, writes).map_err(|why| {
             let ip = self.listen.ip();
             SystemError::View(format!(
                 "port {port} of {ip} cannot be listened on for Foxglove: {why}; end the program that has it, or choose another one with --foxglove PORT"
@@ -101,6 +106,11 @@ pub(crate) fn show(order: &Order, arguments: &Arguments) -> Result<Report, Syste
         ));
     }
     let foxglove = order.bind_foxglove(&mut server)?;
+    if order.foxglove_open {
+        output::note(format_args!(
+            "sinew: warning: every program and user of this host can read the messages and parameters that are offered to Foxglove"
+        ));
+    }
     output::line(&announcement(&server, &path, foxglove.as_deref(), arguments.json));
     let end = server.run(nodes);
     end.map_err(|why| {

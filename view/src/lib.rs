@@ -54,7 +54,7 @@ mod source;
 mod stop;
 mod stream;
 
-pub use foxglove::Writes;
+pub use foxglove::{Reads, Writes};
 pub use metrics::{METRICS, Metric, Shape};
 pub use server::Server;
 pub use snapshot::{Answers, NODES_MAX, NodeAnswers, Snapshot};

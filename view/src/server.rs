@@ -20,7 +20,7 @@ use crate::{
     answer::{self, Identity, Shared},
     auth::{self, Token},
     cache::{Cache, PAGE_FRESH},
-    foxglove::{self, Hub, Writes},
+    foxglove::{self, Hub, Reads, Writes},
     pages::{Pages, wall_s},
     source::Source,
     stream::Line,
@@ -83,18 +83,18 @@ impl Server {
     /// # Examples
     ///
     /// ```
-    /// use sinew_view::{Server, Writes};
+    /// use sinew_view::{Reads, Server, Writes};
     ///
     /// let mut server = Server::bind("127.0.0.1:0".parse().expect("an address"))?;
-    /// let address = server.bind_foxglove(0, Writes::Refused)?;
+    /// let address = server.bind_foxglove(0, Reads::WithToken, Writes::Refused)?;
     /// assert!(address.starts_with("ws://127.0.0.1:") && address.contains("/?token="));
     /// # Ok::<(), std::io::Error>(())
     /// ```
-    pub fn bind_foxglove(&mut self, port: u16, writes: Writes) -> io::Result<String> {
+    pub fn bind_foxglove(&mut self, port: u16, reads: Reads, writes: Writes) -> io::Result<String> {
         let (listener, address) = bind(SocketAddr::new(self.address.ip(), port))?;
         let token = Token::random()?;
         let shown = format!("ws://{}/?token={}", reachable(address), token.text());
-        let own = foxglove::Identity { listens: address.ip(), token, writes };
+        let own = foxglove::Identity { listens: address.ip(), token, reads, writes };
         self.foxglove = Some(Foxglove { listener, own });
         Ok(shown)
     }

@@ -311,6 +311,51 @@ fn connection_needs_the_token_and_the_protocol() {
 }
 
 #[test]
+fn open_server_is_read_without_the_token_by_programs_alone() {
+    const NAME: &str = "knee.gains.assistance";
+    // Given
+    let scenario = Scenario::new();
+    let mut knee = scenario.start("knee", 2, &["--tuned"]);
+    knee.wait_for(&["started"]);
+    let view = View::with(&scenario, "knee", &["--foxglove", "0", "--foxglove-open", "--foxglove-writes"]);
+    let (address, _) = parts(&view.foxglove);
+    let legal = upgrade(address, "foxglove.sdk.v1");
+    for (origin, status) in [
+        ("Origin: https://app.example\r\n".to_owned(), 401),
+        (format!("Origin: http://{address}\r\n"), 401),
+        (format!("Origin: ws://{address}\r\n"), 101),
+    ] {
+        let (_stream, head) = request(address, "/", &(legal.clone() + &origin));
+        assert!(head.starts_with(&format!("HTTP/1.1 {status} ")), "{origin}: {head}");
+    }
+    // When: a client without the token sets a parameter, as those with it may
+    let (stream, head) = request(address, "/", &legal);
+    assert!(head.starts_with("HTTP/1.1 101 "), "{head}");
+    let mut client = Client(WebSocket::from_raw_socket(stream, Role::Client, None));
+    client.find("advertise", |json| json["channels"].as_array().map(|_| ()));
+    let parameters = json!([{ "name": NAME, "value": 0.5 }]);
+    client.send(&json!({ "op": "setParameters", "id": "s", "parameters": parameters }));
+    // Then
+    let why = client.find("status", |json| json["message"].as_str().map(str::to_owned));
+    assert!(why.contains("with the token"), "{why}");
+    let answer = scenario.sinew("knee", &["param", "get", NAME]);
+    assert_eq!(answer.out, "0.3\n", "{}", answer.err);
+}
+
+#[test]
+fn silent_connections_leave_room_for_clients() {
+    let scenario = Scenario::new();
+    let _knee = scenario.start("knee", 2, &[]);
+    let view = View::with(&scenario, "knee", &["--foxglove", "0"]);
+    let (address, _) = parts(&view.foxglove);
+    // As many as are served at a time, which send no request
+    let silent: Vec<_> = (0..16).map(|_| TcpStream::connect(address).expect("it listens")).collect();
+    let mut client = Client::of(&view);
+    client.find("serverInfo", |_| Some(()));
+    drop(silent);
+}
+
+#[test]
 fn clients_have_a_bound() {
     let scenario = Scenario::new();
     let _knee = scenario.start("knee", 2, &[]);

@@ -304,7 +304,7 @@ async fn answer(
     let (known, faults) = match writes {
         _ if given.is_empty() => (known, Vec::new()),
         Writes::Refused => {
-            let why = "parameters are not set here; start sinew view with --foxglove-writes";
+            let why = "parameters are set only by clients with the token, if sinew view was started with --foxglove-writes";
             (known, vec![why.to_owned()])
         }
         Writes::Allowed => {

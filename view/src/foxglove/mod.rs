@@ -54,15 +54,35 @@ pub(crate) const CONNECTIONS_MAX: usize = 2 * hub::CLIENTS_MAX;
 /// Time limit for the request and its answer.
 const OPENED_WITHIN: Duration = Duration::from_secs(5);
 
-/// Whether clients may set parameters.
+/// The clients that may read messages and parameters.
 ///
 /// # Examples
 ///
 /// ```
-/// use sinew_view::{Server, Writes};
+/// use sinew_view::{Reads, Server, Writes};
 ///
 /// let mut server = Server::bind("127.0.0.1:0".parse().expect("an address"))?;
-/// let address = server.bind_foxglove(0, Writes::Allowed)?;
+/// server.bind_foxglove(0, Reads::OnThisHost, Writes::Refused)?;
+/// # Ok::<(), std::io::Error>(())
+/// ```
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Reads {
+    /// Those with the token.
+    #[default]
+    WithToken,
+    /// Also programs that connect over loopback without a token, and set nothing. Pages of browsers need it.
+    OnThisHost,
+}
+
+/// Whether clients with the token may set parameters.
+///
+/// # Examples
+///
+/// ```
+/// use sinew_view::{Reads, Server, Writes};
+///
+/// let mut server = Server::bind("127.0.0.1:0".parse().expect("an address"))?;
+/// let address = server.bind_foxglove(0, Reads::default(), Writes::Allowed)?;
 /// assert!(address.starts_with("ws://127.0.0.1:"));
 /// # Ok::<(), std::io::Error>(())
 /// ```
@@ -80,6 +100,7 @@ pub enum Writes {
 pub(crate) struct Identity {
     pub(crate) listens: IpAddr,
     pub(crate) token: Token,
+    pub(crate) reads: Reads,
     pub(crate) writes: Writes,
 }
 
@@ -87,10 +108,11 @@ pub(crate) struct Identity {
 pub(crate) async fn serve(stream: TcpStream, shared: Arc<Shared>, hub: Hub, own: Arc<Identity>) {
     let opened = Arc::new(Mutex::new(None));
     let (of, identity) = (Arc::clone(&opened), Arc::clone(&own));
+    let is_local = stream.peer_addr().is_ok_and(|peer| peer.ip().to_canonical().is_loopback());
     let service = service_fn(move |request: Request<Incoming>| {
-        let (response, upgrade) = open(request, &identity);
-        if let Some(upgrade) = upgrade {
-            *of.lock().unwrap_or_else(PoisonError::into_inner) = Some(upgrade);
+        let (response, accepted) = open(request, &identity, is_local);
+        if accepted.is_some() {
+            *of.lock().unwrap_or_else(PoisonError::into_inner) = accepted;
         }
         async move { Ok::<_, Infallible>(response) }
     });
@@ -105,18 +127,22 @@ pub(crate) async fn serve(stream: TcpStream, shared: Arc<Shared>, hub: Hub, own:
         .with_upgrades();
     // An error is the client's, which sees it.
     let _ = timeout(OPENED_WITHIN, connection).await;
-    let upgrade: Option<OnUpgrade> = opened.lock().unwrap_or_else(PoisonError::into_inner).take();
-    let Some(upgrade) = upgrade else { return };
+    let opened: Option<(OnUpgrade, Writes)> = opened.lock().unwrap_or_else(PoisonError::into_inner).take();
+    let Some((upgrade, writes)) = opened else { return };
     if let Ok(Ok(upgraded)) = timeout(OPENED_WITHIN, upgrade).await {
-        client::serve(TokioIo::new(upgraded), shared, hub, own.writes).await;
+        client::serve(TokioIo::new(upgraded), shared, hub, writes).await;
     }
 }
 
-/// Answers the request of a connection. An accepted one becomes a client.
-fn open(mut request: Request<Incoming>, own: &Identity) -> (Response<Content>, Option<OnUpgrade>) {
+/// Answers the request of a connection. An accepted one becomes a client with these rights.
+fn open(
+    mut request: Request<Incoming>,
+    own: &Identity,
+    is_local: bool,
+) -> (Response<Content>, Option<(OnUpgrade, Writes)>) {
     let has_body = !request.body().is_end_stream();
     let head = Head { method: request.method(), uri: request.uri(), headers: request.headers(), has_body };
-    let accepted = match handshake::check(head, own.listens, &own.token) {
+    let accepted = match handshake::check(head, own, is_local) {
         Ok(accepted) => accepted,
         Err(error) => {
             let mut response = answer::refused(error);
@@ -134,5 +160,5 @@ fn open(mut request: Request<Incoming>, own: &Identity) -> (Response<Content>, O
     if let Ok(proof) = HeaderValue::from_str(&accepted.proof) {
         headers.insert(SEC_WEBSOCKET_ACCEPT, proof);
     }
-    (response, Some(hyper::upgrade::on(&mut request)))
+    (response, Some((hyper::upgrade::on(&mut request), accepted.writes)))
 }
