@@ -34,6 +34,12 @@ const RETRIED_EVERY: Duration = Duration::from_secs(30);
 /// Time after which a node is looked for that has ended a recording.
 const RENEWED_AFTER: Duration = Duration::from_secs(1);
 
+/// The topics that are about all messages: they have all that are shown recorded.
+const ABOUT_ALL: [&str; 2] = ["/sinew/tally", "/sinew/outcomes"];
+/// Selects no message: none of Sinew's own types has this name. Events, barriers, clocks and log lines are in each
+/// journal.
+const NO_TYPE: &str = "sinew.view.none";
+
 /// The source, the type and the node of the messages of a topic.
 #[derive(Clone, Debug, PartialEq, Eq)]
 struct Origin {
@@ -187,10 +193,13 @@ impl Channels {
         if wanted.is_empty() {
             return None;
         }
-        if wanted.iter().any(|topic| self.fixed.contains(topic)) {
+        if ABOUT_ALL.iter().any(|topic| wanted.contains(*topic)) {
             return Some(self.shown.clone());
         }
         let origins: Vec<_> = wanted.iter().filter_map(|topic| self.origins.get(topic)).collect();
+        if origins.is_empty() {
+            return Some(Selection { types: vec![NO_TYPE.to_owned()], ..Selection::default() });
+        }
         let names = |of: fn(&Origin) -> &String| {
             let names: BTreeSet<_> = origins.iter().map(|origin| of(origin).clone()).collect();
             names.into_iter().collect()

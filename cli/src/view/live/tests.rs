@@ -27,7 +27,7 @@ fn channels() -> Channels {
     let entry = Arc::new(Entry::new(PathBuf::new()));
     let shown = Selection { apps: vec!["*".to_owned()], ..Selection::default() };
     let mut channels = Channels::new(entry, Duration::ZERO, shown);
-    channels.fixed.insert("/sinew/tally".to_owned());
+    channels.fixed = ViewWriter::fixed_channels().into_iter().map(|channel| channel.topic).collect();
     for (topic, origin) in [
         ("/hip/a/view", origin("hip", "a", 1)),
         ("/knee/b/view", origin("knee", "b", 2)),
@@ -70,9 +70,18 @@ fn only_nodes_with_wanted_topics_record() {
     channels.wanted.insert("/far/c/view".to_owned());
     assert_eq!(selected(&channels, 1), Some((names(&["far"]), names(&["c"]))));
     assert_eq!(selected(&channels, 2), Some((names(&["far", "knee"]), names(&["b", "c"]))));
-    // And: counters are of all messages
-    channels.wanted.insert("/sinew/tally".to_owned());
-    assert_eq!(selected(&channels, 1), Some((names(&["*"]), Vec::new())));
+    // And: counters and outcomes are of all messages
+    for topic in ABOUT_ALL {
+        assert!(channels.fixed.contains(topic), "{topic}");
+        channels.wanted.insert(topic.to_owned());
+        assert_eq!(selected(&channels, 1), Some((names(&["*"]), Vec::new())));
+        channels.wanted.remove(topic);
+    }
+    // And: log lines need no message
+    channels.wanted.insert("/sinew/log".to_owned());
+    assert_eq!(selected(&channels, 1), Some((names(&["far"]), names(&["c"]))));
+    channels.wanted = BTreeSet::from(["/sinew/log".to_owned()]);
+    assert_eq!(selected(&channels, 1), Some((Vec::new(), names(&[NO_TYPE]))));
 }
 
 #[test]
