@@ -46,8 +46,8 @@ const ANSWER_WITHIN: Duration = Duration::from_secs(5);
 const ASKED_WITHIN: Duration = Duration::from_secs(12);
 /// Bytes of the body of a request.
 const BODY_BYTES_MAX: usize = 16 * 1_024;
-/// Parameters of one set.
-const VALUES_MAX: usize = 64;
+/// Parameters of one set of an application.
+pub(crate) const VALUES_MAX: usize = 64;
 /// Questions to applications at a time. Further ones wait.
 const QUESTIONS_MAX: usize = 2;
 /// Presses and releases of the stop at a time. They wait for no question.

@@ -11,10 +11,7 @@ use serde_json::{Value as Json, json};
 use sinew::parameters::{NamedValue, ParameterList, ParameterOutcome, SetParameters, Value};
 
 use super::protocol::GivenParameter;
-use crate::answer::{self, Shared};
-
-/// The values of a set of one application, at most.
-const VALUES_MAX: usize = 64;
+use crate::answer::{self, Shared, VALUES_MAX};
 
 /// A parameter of an application.
 #[derive(Clone, Debug, PartialEq)]
