@@ -213,6 +213,48 @@ fn client_gets_as_many_messages_as_the_audit_counts() {
 }
 
 #[test]
+fn recording_ends_with_a_client_that_is_gone() {
+    let scenario = Scenario::new();
+    let (_knee, _, mut sensor) = start(&scenario, Registration::new().sends::<Count>());
+    let view = View::with(&scenario, "knee", &["--foxglove", "0"]);
+    let mut client = Client::of(&view);
+    client.subscribe(TOPIC, 7);
+    until("the node records", || (programs(&mut sensor) == 1).then_some(()));
+    // When: it ends without a word
+    drop(client);
+    until("the recording ends", || (programs(&mut sensor) == 0).then_some(()));
+    assert_eq!(view.metrics().value("sinew_foxglove_clients"), Some(0.0));
+}
+
+#[test]
+fn malformed_messages_are_answered_and_too_large_ones_close() {
+    let scenario = Scenario::new();
+    let _knee = scenario.start("knee", 2, &[]);
+    let view = View::with(&scenario, "knee", &["--foxglove", "0"]);
+    let mut client = Client::of(&view);
+    for (message, part) in [
+        (Message::text("no JSON"), "no message of foxglove.websocket.v1"),
+        (Message::text(r#"{"op":"subscribe"}"#), "missing field"),
+        (Message::text(r#"{"op":"advertise","channels":[]}"#), "messages and parameters only"),
+        (Message::binary(vec![1, 2, 3]), "`sinew send`"),
+        (
+            Message::text(r#"{"op":"subscribe","subscriptions":[{"id":1,"channelId":9999}]}"#),
+            "no channel 9999",
+        ),
+    ] {
+        client.0.send(message).expect("it is read");
+        let why = client.find("status", |json| json["message"].as_str().map(str::to_owned));
+        assert!(why.contains(part), "{why}");
+    }
+    // The server may close it before it has read everything.
+    let _ = client.0.send(Message::text("x".repeat(300 * 1_024)));
+    let end = std::iter::repeat_with(|| client.0.read()).find_map(Result::err).expect("it ends");
+    let is_open =
+        matches!(&end, Error::Io(why) if matches!(why.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut));
+    assert!(!is_open, "{end}");
+}
+
+#[test]
 fn channels_of_undeclared_types_come_with_the_tally() {
     // Given: an application that sends a type, which it has not declared
     let scenario = Scenario::new();
