@@ -66,8 +66,8 @@ pub(super) fn check(head: Head<'_>, own: &Identity, is_local: bool) -> Result<Ac
     Ok(Accepted { protocol, proof: proof(key), writes })
 }
 
-/// Returns whether a page of a browser may have sent a request. A browser names the page's site in `Origin`, and no site
-/// has the scheme `ws`, which some libraries of programs name there.
+/// Returns whether a page of a browser may have sent a request. A browser names the page's site in `Origin`, and no
+/// site has the scheme `ws`, which some libraries of programs name there.
 fn is_of_page(headers: &HeaderMap, host: &Authority) -> bool {
     let own = format!("ws://{host}");
     headers.get_all(ORIGIN).iter().any(|origin| !origin.as_bytes().eq_ignore_ascii_case(own.as_bytes()))
