@@ -85,7 +85,7 @@ pub(super) async fn set(shared: &Arc<Shared>, given: &[GivenParameter], known: &
             Ok(ParameterOutcome::Refused { why }) => faults.push(format!("{app}: refused: {why}")),
             // Only the values of a transaction are held.
             Ok(ParameterOutcome::Held { .. }) => {
-                faults.push(format!("{app}: it answered as to a transaction; update it"));
+                faults.push(format!("{app}: it answered with a state of a transaction; update it"));
             }
             Err(why) => faults.push(format!("{app}: {why}")),
         }
