@@ -358,7 +358,7 @@ mod tests {
     }
 
     #[tokio::test(start_paused = true)]
-    async fn slow_client_is_kept_and_one_that_reads_nothing_is_closed() {
+    async fn slow_client_is_kept_and_stuck_one_closed() {
         const SENT: usize = 100;
         const BYTES: usize = 16 * 1_024;
         // Given: a client that reads 40 KiB in a second
