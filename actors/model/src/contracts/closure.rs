@@ -177,25 +177,29 @@ impl<'r> System<'r> {
                 "the chain through {executor} has more than {CHAIN_MAX} steps, or is a circle"
             ));
         }
-        let reports = self.0;
-        let all = move || {
-            reports
-                .iter()
-                .flat_map(|report| report.contracts.iter().map(move |contract| At { report, contract }))
-        };
-        let first = all()
+        let all = self.0.iter();
+        let mut of_subject = all
+            .flat_map(|report| report.contracts.iter().map(move |contract| At { report, contract }))
             .filter(|first| first.contract.app_name == executor && first.contract.subject == *subject)
-            .find_map(|first| {
+            .filter_map(|first| {
                 Some((first, first.contract.conditions().find(|other| is_same(*other, condition))?))
             });
-        let first = first.ok_or_else(|| {
+        let first = of_subject.next().ok_or_else(|| {
             format!(
                 "{executor} has no contract for {subject} being {}: declare one with {executor}",
                 word(condition)
             )
         })?;
+        if let Some((other, _)) = of_subject.find(|(other, _)| other.contract.app != first.0.contract.app) {
+            let (one, other) = (first.0.contract.app, other.contract.app);
+            return Err(format!(
+                "{one} and {other} are both called {executor}, so `through` names no single application: give each a name of its own"
+            ));
+        }
         let of_executor = Subject::Application(executor.to_owned());
-        let own = all().find(|own| {
+        // Of its own node's report: another node cannot declare it.
+        let report = at.report;
+        let own = report.contracts.iter().map(|contract| At { report, contract }).find(|own| {
             let own = own.contract;
             own.app == *app && own.stopped && own.subject == of_executor
         });

@@ -184,6 +184,19 @@ fn lateness_that_the_executor_tolerates_is_a_finding() {
 }
 
 #[test]
+fn executor_that_shares_its_name_is_a_finding() {
+    let of_knee = [of_gait(75), Contract::when_lost("panel").goes_to("damped", ms(150)).through("gait")];
+    let gait = |node| {
+        let panel = CommandedOutput { receiver: tid(node, 1), sender: tid(3, 1), ..output("panel") };
+        report(node, "gait", &[of_panel()], vec![panel])
+    };
+    let closure = Closure::of(&[gait(1), gait(4), knee(&of_knee)]);
+    let found = faults(&closure);
+    assert!(matches!(found[..], [why] if why.contains("are both called gait")), "{found:?}");
+    assert!(Closure::of(&[gait(1), knee(&of_knee)]).closes());
+}
+
+#[test]
 fn circle_of_contracts_ends_as_a_finding() {
     let through = |executor: &str| {
         let of_panel = Contract::when_lost("panel").goes_to("damped", ms(150)).through(executor);
