@@ -9,6 +9,9 @@ use super::{
     sum::{Part, Sum, millis},
 };
 
+/// Maximum bytes of a sum or a fault. Names of the own applications stay far below it; those from outside have no limit
+/// beside that of the report, and each row repeats them.
+const TEXT_MAX: usize = 4_096;
 /// Maximum depth of contracts that are executed through another application. A chain beyond it is a finding.
 const CHAIN_MAX: usize = 4;
 
@@ -131,8 +134,8 @@ impl<'r> System<'r> {
             within,
             worst: sum.as_ref().map(Sum::total),
             measured,
-            sum: sum.as_ref().map(ToString::to_string).unwrap_or_default(),
-            fault,
+            sum: capped(sum.as_ref().map(ToString::to_string).unwrap_or_default()),
+            fault: fault.map(capped),
         }
     }
 
@@ -345,8 +348,18 @@ fn gap(report: &ContractsReport, output: &CommandedOutput) -> Option<Gap> {
         sender,
         kind_name: output.kind_name.clone(),
         conditions,
-        fault,
+        fault: capped(fault),
     })
+}
+
+/// Returns a text of at most `TEXT_MAX` bytes.
+fn capped(mut text: String) -> String {
+    if text.len() > TEXT_MAX {
+        let end = (0..=TEXT_MAX).rev().find(|end| text.is_char_boundary(*end));
+        text.truncate(end.unwrap_or_default());
+        text.shrink_to_fit();
+    }
+    text
 }
 
 const fn word(condition: Condition) -> &'static str {

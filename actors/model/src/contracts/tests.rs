@@ -197,6 +197,23 @@ fn executor_that_shares_its_name_is_a_finding() {
 }
 
 #[test]
+fn texts_of_a_hostile_report_are_bounded() {
+    let long = "é".repeat(100_000);
+    let mut contract = ContractReport::new(tid(2, 1), &long, &of_gait(1));
+    contract.through = Some(long.clone());
+    let mut hostile = knee(&[of_gait(1)]);
+    hostile.contracts.push(contract);
+    (hostile.outputs[0].kind_name, hostile.outputs[0].sender_node) = (long, None);
+    hostile.contracts[0].stopped = false;
+    hostile.contracts[1].stopped = false;
+    let closure = Closure::of(&[hostile]);
+    assert_eq!(closure.gaps.len(), 1);
+    let sums = closure.rows.iter().map(|row| row.sum.as_str());
+    assert!(faults(&closure).into_iter().chain(sums).all(|text| text.len() <= 4_096));
+    assert!(faults(&closure).iter().any(|text| text.len() > 4_000));
+}
+
+#[test]
 fn circle_of_contracts_ends_as_a_finding() {
     let through = |executor: &str| {
         let of_panel = Contract::when_lost("panel").goes_to("damped", ms(150)).through(executor);
