@@ -1,9 +1,10 @@
 //! Contracts across nodes: the sender of two outputs is lost, hangs or is stopped many times, and the time until each
 //! output is safe is compared with the contract's.
 //!
-//! The processes share the monotonic clock of the machine, so one clock measures the time from the last command, or from
-//! the order to stop, to a safe output. The times are upper bounds: the last command before a kill or a pause was sent up
-//! to one period earlier, and that period is added. Commands that arrive late are injected in the tests of the guard.
+//! The processes share the monotonic clock of the machine, so one clock measures the time from the last command, or
+//! from the order to stop, to a safe output. The times are upper bounds: the last command before a kill or a pause was
+//! sent up to one period earlier, and that period is added. Commands that arrive late are injected in the tests of the
+//! guard.
 
 mod node;
 mod report;

@@ -107,8 +107,8 @@ pub enum Condition {
     /// The subject has crashed or hangs, or its node or the link to it is lost. It begins with the last command that
     /// the subject sent.
     Lost,
-    /// The newest good command was sent more than this time ago. Guards notice it from `age_max` of the type on: younger
-    /// commands are good.
+    /// The newest good command was sent more than this time ago. Guards notice it from `age_max` of the type on:
+    /// younger commands are good.
     Late(Duration),
     /// The subject was stopped in order, or the stop of the whole system was pressed. It begins with the last command
     /// that the subject sent, or with the press at its node. A requirement is not lost by a press; the guarded outputs
