@@ -1,8 +1,10 @@
-//! Contracts across nodes: the sender of two outputs is lost, late or stopped many times, and the time until each
+//! Contracts across nodes: the sender of two outputs is lost, hangs or is stopped many times, and the time until each
 //! output is safe is compared with the contract's.
 //!
-//! The processes share the clock of the machine, so the time from an injection to a safe output is measured on one
-//! clock.
+//! The processes share the monotonic clock of the machine, so one clock measures the time from the last command, or
+//! from the order to stop, to a safe output. The times are upper bounds: the last command before a kill or a pause was
+//! sent up to one period earlier, and that period is added. Commands that arrive late are injected in the tests of the
+//! guard.
 
 mod node;
 mod report;
@@ -13,7 +15,7 @@ use std::time::Duration;
 use sinew::Time;
 
 pub(crate) use node::run as run_node;
-pub use node::{LATE, WATCHDOG};
+pub use node::{PERIOD, WATCHDOG};
 pub use report::Report;
 use system::System;
 
@@ -53,11 +55,13 @@ impl Injection {
         Self::ALL[round as usize % Self::ALL.len()]
     }
 
-    /// Returns the time from the last command to the begin of the condition.
-    const fn begins_after(self) -> Duration {
+    /// Returns how long before its injection the condition may have begun.
+    const fn began_before(self) -> Duration {
         match self {
-            Self::Pause => LATE,
-            Self::Kill | Self::Leave | Self::Press => Duration::ZERO,
+            // With the last command.
+            Self::Kill | Self::Pause => PERIOD,
+            // Commands are sent until the order is executed.
+            Self::Leave | Self::Press => Duration::ZERO,
         }
     }
 }
@@ -93,7 +97,7 @@ fn play(system: &mut System, injection: Injection, report: &mut Report) {
         let safe_ns = system.wait_until_safe(node);
         // An output that a late command had made safe before has no such time.
         if let Some(took) = safe_ns.checked_sub(began.as_nanos()) {
-            let took = Duration::from_nanos(took).saturating_sub(injection.begins_after());
+            let took = Duration::from_nanos(took) + injection.began_before();
             report.claim(took <= WITHIN, || {
                 format!("{node} was safe {took:?} after {injection:?}, not within {WITHIN:?}")
             });

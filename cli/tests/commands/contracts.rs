@@ -49,7 +49,7 @@ fn contracts_of_two_nodes_close() {
     let table = scenario.sinew("left", &["contracts"]);
     assert_eq!(table.code, Some(0), "{}{}", table.out, table.err);
     assert!(
-        table.out.contains("control late by 100.0 ms") && table.out.contains("all close"),
+        table.out.contains("control late by 160.0 ms") && table.out.contains("all close"),
         "{}",
         table.out
     );

@@ -107,10 +107,12 @@ pub enum Condition {
     /// The subject has crashed or hangs, or its node or the link to it is lost. It begins with the last command that
     /// the subject sent.
     Lost,
-    /// No command that was sent within this time is there. It begins so long after the last good command was sent.
+    /// The newest good command was sent more than this time ago. Guards notice it from `age_max` of the type on:
+    /// younger commands are good.
     Late(Duration),
     /// The subject was stopped in order, or the stop of the whole system was pressed. It begins with the last command
-    /// that the subject sent, or with the press at its node.
+    /// that the subject sent, or with the press at its node. A requirement is not lost by a press; the guarded outputs
+    /// that its application commands are stopped by the press itself.
     Stopped,
 }
 
@@ -131,7 +133,7 @@ impl fmt::Display for Condition {
 /// ```
 /// use sinew::{contracts::Contract, prelude::*};
 ///
-/// let conditions = Contract::when_lost("gait").or_late(Duration::from_millis(10)).or_stopped();
+/// let conditions = Contract::when_lost("gait").or_late(Duration::from_millis(60)).or_stopped();
 /// let contract = conditions.goes_to("damped", Duration::from_millis(100));
 /// assert_eq!(contract.state(), "damped");
 /// ```
@@ -155,7 +157,8 @@ impl ContractConditions {
         self
     }
 
-    /// Adds its lateness: no command that was sent within `time` is there. Up to 60 s.
+    /// Adds its lateness: its newest good command was sent more than `time` ago. At least `age_max` of the type, as
+    /// younger commands are good; up to 60 s.
     pub const fn or_late(mut self, time: Duration) -> Self {
         self.late = Some(time);
         self
@@ -188,7 +191,7 @@ impl ContractConditions {
 /// const MS: Duration = Duration::from_millis(1);
 ///
 /// // The knee obeys the gait.
-/// let of_gait = Contract::when_lost("gait").or_late(10 * MS).or_stopped().goes_to("damped", 100 * MS);
+/// let of_gait = Contract::when_lost("gait").or_late(60 * MS).or_stopped().goes_to("damped", 100 * MS);
 /// // The gait obeys the operator's panel, and sends no command without it. So the knee is damped then, too.
 /// let of_panel = Contract::when_lost("panel").goes_to("damped", 700 * MS).through("gait");
 /// let of_node = Contract::when_stopped(Subject::node("central")).goes_to("damped", 100 * MS);
@@ -207,7 +210,8 @@ impl Contract {
         ContractConditions::of(subject.into()).or_lost()
     }
 
-    /// Begins a contract for the case that no command of `subject` is there that was sent within `time`.
+    /// Begins a contract for the case that the newest good command of `subject` was sent more than `time` ago. At least
+    /// `age_max` of the type, as younger commands are good; up to 60 s.
     pub fn when_late(subject: impl Into<Subject>, time: Duration) -> ContractConditions {
         ContractConditions::of(subject.into()).or_late(time)
     }

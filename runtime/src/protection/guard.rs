@@ -315,6 +315,7 @@ impl<O: Send + 'static> Guard<O> {
                 return Released::Before;
             }
             shared.watch.is_releasing.store(true, Ordering::Release);
+            inner.dry_run = None;
             shared.retry_safe(inner, shared.clock.now());
             shared.decide_locked(inner, |receiver, _| receiver.trip(Cause::Dropped));
             if self.is_released() { Released::Now } else { Released::NotSafe }
@@ -372,7 +373,11 @@ impl<O: Send + 'static> Drop for Owners<O> {
             // function that trips another guard.
             return;
         }
-        self.0.decide(|receiver, _| receiver.trip(Cause::Dropped));
+        self.0.with(|inner| {
+            // Another guard may have the device from now on.
+            inner.dry_run = None;
+            self.0.decide_locked(inner, |receiver, _| receiver.trip(Cause::Dropped));
+        });
         self.0.watch.is_orphan.store(true, Ordering::Release);
         if self.0.watch.needs_retry.load(Ordering::Acquire) && self.0.wake_up.is_none() {
             // The guard has no other owner, and the output is not safe yet.

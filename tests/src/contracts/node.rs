@@ -24,9 +24,10 @@ use sinew_testkit::{
 
 use super::NODES;
 
-const PERIOD: Duration = Duration::from_millis(20);
-/// Age of the newest command from which its sender is late.
-pub const LATE: Duration = Duration::from_millis(100);
+/// Time from one command to the next.
+pub const PERIOD: Duration = Duration::from_millis(20);
+/// Age of the newest command from which its sender is late: that of the oldest one that an output accepts.
+const LATE: Duration = Duration::from_millis(160);
 /// Time from the last command to a safe output: 160 ms of age, and 60 ms of silence. The contracts add the slack.
 pub const WATCHDOG: Duration = Duration::from_millis(220);
 const CONTROL: AppAddress = AppAddress::new(0x1001);

@@ -15,7 +15,7 @@ const SHOWN_MAX: usize = 20;
 pub struct Report {
     /// Number of injected conditions.
     pub rounds: u32,
-    /// Time from the begin of the condition until an output was safe: killed, paused, left in order, pressed.
+    /// Time from the last command, or from the order, until an output was safe: killed, paused, left in order, pressed.
     pub times: [Times; Injection::ALL.len()],
     /// The longest dry run at the start.
     pub dry_run: Option<Duration>,
@@ -48,7 +48,7 @@ impl Report {
         let times = self.times.iter().map(Times::json).collect::<Vec<_>>();
         json!({
             "bench": "contracts", "rounds": self.rounds, "violations": self.violation_count,
-            "lost": times[Injection::Kill as usize], "late": times[Injection::Pause as usize],
+            "lost": times[Injection::Kill as usize], "paused": times[Injection::Pause as usize],
             "stopped": times[Injection::Leave as usize], "stopped_by_press": times[Injection::Press as usize],
             "within_ms": WITHIN.as_millis() as u64, "dry_run_ms": self.dry_run.map(|time| time.as_secs_f64() * 1e3),
         })
@@ -64,12 +64,12 @@ impl fmt::Display for Report {
         writeln!(
             f,
             "{:<44} {:>6} {:>9} {:>9} {:>9}",
-            "condition to safe output", "count", "p50 ms", "p99 ms", "max ms"
+            "last command or order to safe output", "count", "p50 ms", "p99 ms", "max ms"
         )?;
         for injection in Injection::ALL {
             let name = match injection {
                 Injection::Kill => "lost: its process is killed",
-                Injection::Pause => "late: its process is paused",
+                Injection::Pause => "lost: its process is paused",
                 Injection::Leave => "stopped: its node stops in order",
                 Injection::Press => "stopped: the stop of the system is pressed",
             };

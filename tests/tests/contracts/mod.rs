@@ -130,7 +130,7 @@ impl Leg {
 }
 
 fn of_control(within: Duration) -> Contract {
-    Contract::when_lost("control").or_late(PROTECTION.within).or_stopped().goes_to("damped", within)
+    Contract::when_lost("control").or_late(PROTECTION.age_max).or_stopped().goes_to("damped", within)
 }
 
 #[test]
@@ -166,12 +166,12 @@ fn missing_contract_and_too_short_time_are_found() {
     let leg = Leg::start([of_control(Duration::from_millis(1_104))]);
     let closure = leg.closure();
     assert_eq!(closure.gaps, []);
-    // It is late 300 ms after the last command, so that time is enough.
+    // It is late 800 ms after the last command, so that time is enough.
     for row in [&closure.rows[0], &closure.rows[2]] {
         assert!(
             row.fault.as_ref().is_some_and(|why| why.contains("= 1105.0 ms, more than 1104.0 ms")),
             "{row:?}"
         );
     }
-    assert_eq!(closure.rows[1].worst, Some(Duration::from_millis(805)));
+    assert_eq!(closure.rows[1].worst, Some(Duration::from_millis(305)));
 }

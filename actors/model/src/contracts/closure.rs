@@ -9,6 +9,9 @@ use super::{
     sum::{Part, Sum, millis},
 };
 
+/// Maximum bytes of a sum or a fault. Names of the own applications stay far below it; those from outside have no limit
+/// beside that of the report, and each row repeats them.
+const TEXT_MAX: usize = 4_096;
 /// Maximum depth of contracts that are executed through another application. A chain beyond it is a finding.
 const CHAIN_MAX: usize = 4;
 
@@ -36,7 +39,8 @@ pub struct ContractRow {
     pub state: String,
     /// The declared time.
     pub within: Duration,
-    /// The worst time from the begin of the condition, by the settings; `None`: nothing executes the contract.
+    /// The worst time from the begin of the condition, by the settings; `None`: nothing executes the contract, or its
+    /// executor does not notice the condition.
     pub worst: Option<Duration>,
     /// The same time in a dry run; `None`: there was none.
     pub measured: Option<Duration>,
@@ -120,6 +124,7 @@ impl<'r> System<'r> {
             Ok(_) => slow_output(at),
         };
         let sum = sum.ok();
+        let measured = sum.as_ref().and_then(|_| self.measured(at, condition, CHAIN_MAX));
         ContractRow {
             node: at.report.name.clone(),
             app: app_name.clone(),
@@ -128,9 +133,9 @@ impl<'r> System<'r> {
             state: state.clone(),
             within,
             worst: sum.as_ref().map(Sum::total),
-            measured: self.measured(at, condition, CHAIN_MAX),
-            sum: sum.as_ref().map(ToString::to_string).unwrap_or_default(),
-            fault,
+            measured,
+            sum: capped(sum.as_ref().map(ToString::to_string).unwrap_or_default()),
+            fault: fault.map(capped),
         }
     }
 
@@ -139,14 +144,19 @@ impl<'r> System<'r> {
     fn sum(self, at: At<'r>, condition: Condition, depth: usize) -> Result<Sum, String> {
         if let Some(executor) = &at.contract.through {
             let (first, own) = self.chain(at, executor, condition, depth)?;
-            let later = late_by(first.1).saturating_sub(late_by(condition));
-            let mut sum = self.sum(first.0, first.1, depth - 1)?;
-            if !later.is_zero() {
-                let name = format!("until {executor} takes it for late");
-                let remedy = format!("shorten `late` in the contract of {executor}");
-                sum.parts.push(Part { name, time: later, remedy });
+            let tolerated = late_by(first.1);
+            if tolerated > late_by(condition) {
+                let (subject, tolerated) = (&at.contract.subject, millis(tolerated));
+                return Err(format!(
+                    "{executor} takes {subject} for late by {tolerated}, and does nothing before: declare `late` of at least {tolerated} here, or shorten \
+                     it with {executor}"
+                ));
             }
+            let sum = self.sum(first.0, first.1, depth - 1)?;
             return Ok(sum.and_then(self.sum(own, Condition::Stopped, depth - 1)?));
+        }
+        if let Some(why) = unnoticed(at, condition) {
+            return Err(why);
         }
         let sums = at.outputs().map(|output| of_guard(at, output, condition));
         if let Some(worst) = sums.max_by_key(Sum::total) {
@@ -170,25 +180,29 @@ impl<'r> System<'r> {
                 "the chain through {executor} has more than {CHAIN_MAX} steps, or is a circle"
             ));
         }
-        let reports = self.0;
-        let all = move || {
-            reports
-                .iter()
-                .flat_map(|report| report.contracts.iter().map(move |contract| At { report, contract }))
-        };
-        let first = all()
+        let all = self.0.iter();
+        let mut of_subject = all
+            .flat_map(|report| report.contracts.iter().map(move |contract| At { report, contract }))
             .filter(|first| first.contract.app_name == executor && first.contract.subject == *subject)
-            .find_map(|first| {
+            .filter_map(|first| {
                 Some((first, first.contract.conditions().find(|other| is_same(*other, condition))?))
             });
-        let first = first.ok_or_else(|| {
+        let first = of_subject.next().ok_or_else(|| {
             format!(
                 "{executor} has no contract for {subject} being {}: declare one with {executor}",
                 word(condition)
             )
         })?;
+        if let Some((other, _)) = of_subject.find(|(other, _)| other.contract.app != first.0.contract.app) {
+            let (one, other) = (first.0.contract.app, other.contract.app);
+            return Err(format!(
+                "{one} and {other} are both called {executor}, so `through` names no single application: give each a name of its own"
+            ));
+        }
         let of_executor = Subject::Application(executor.to_owned());
-        let own = all().find(|own| {
+        // Of its own node's report: another node cannot declare it.
+        let report = at.report;
+        let own = report.contracts.iter().map(|contract| At { report, contract }).find(|own| {
             let own = own.contract;
             own.app == *app && own.stopped && own.subject == of_executor
         });
@@ -212,7 +226,8 @@ impl<'r> System<'r> {
 }
 
 /// Returns the worst time of an output that the subject commands. A command is good up to `age_max` after the echo
-/// that it quotes, so it arrives at most `age_max` after it was sent. The output is safe `within` after its arrival.
+/// that it quotes, so it arrives at most `age_max` after it was sent. The output is safe `within` after its arrival. A
+/// lateness is at least `age_max` ([`unnoticed`]), so a good command that arrives ends it.
 fn of_guard(at: At<'_>, output: &CommandedOutput, condition: Condition) -> Sum {
     let kind = &output.kind_name;
     let limit = |setting: &str, micros| Part {
@@ -223,6 +238,22 @@ fn of_guard(at: At<'_>, output: &CommandedOutput, condition: Condition) -> Sum {
     let parts = vec![limit("age_max", output.age_max_us), limit("within", output.within_us), slack(at)];
     let watchdog = Duration::from_micros(output.age_max_us.saturating_add(output.within_us));
     Sum { parts, passed: late_by(condition).min(watchdog) }
+}
+
+/// Returns why the guards do not notice this lateness, if they do not: commands up to `age_max` old are good, so an
+/// output stays live as long as they arrive.
+fn unnoticed(at: At<'_>, condition: Condition) -> Option<String> {
+    let Condition::Late(late) = condition else { return None };
+    let oldest = at.outputs().max_by_key(|output| output.age_max_us)?;
+    let age_max = Duration::from_micros(oldest.age_max_us);
+    (late < age_max).then(|| {
+        let (subject, kind, age_max) = (&at.contract.subject, &oldest.kind_name, millis(age_max));
+        format!(
+            "the guard accepts commands of {kind} up to age_max of {age_max}, so {subject} may stay late by {}: declare `late` of at least {age_max}, or \
+             shorten age_max in the type's `Protection`",
+            millis(late)
+        )
+    })
 }
 
 /// Returns the worst time of an application that requires the subject, and has a safe state for its loss.
@@ -302,7 +333,8 @@ fn gap(report: &ContractsReport, output: &CommandedOutput) -> Option<Gap> {
     let fault = if output.sender_name.is_some() {
         format!(
             "{app} obeys {sender} by {kind}, and has no contract for {sender} being {conditions_text}: declare \
-             `Contract::when_lost(\"{sender}\").or_late(TIME).or_stopped().goes_to(STATE, TIME)` with its `AppSpec`"
+             `Contract::when_lost(\"{sender}\").or_late(TIME).or_stopped().goes_to(STATE, TIME)` with its `AppSpec`; the first TIME is at least {}",
+            millis(Duration::from_micros(output.age_max_us))
         )
     } else {
         format!(
@@ -316,8 +348,18 @@ fn gap(report: &ContractsReport, output: &CommandedOutput) -> Option<Gap> {
         sender,
         kind_name: output.kind_name.clone(),
         conditions,
-        fault,
+        fault: capped(fault),
     })
+}
+
+/// Returns a text of at most `TEXT_MAX` bytes.
+fn capped(mut text: String) -> String {
+    if text.len() > TEXT_MAX {
+        let end = (0..=TEXT_MAX).rev().find(|end| text.is_char_boundary(*end));
+        text.truncate(end.unwrap_or_default());
+        text.shrink_to_fit();
+    }
+    text
 }
 
 const fn word(condition: Condition) -> &'static str {

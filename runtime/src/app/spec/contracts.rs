@@ -20,7 +20,7 @@ impl<A: Actor<Context = AppContext<A>>> AppSpec<A> {
     /// # impl Actor for Knee { type Context = AppContext<Self>; }
     ///
     /// const MS: Duration = Duration::from_millis(1);
-    /// let of_gait = Contract::when_lost("gait").or_late(10 * MS).or_stopped().goes_to("damped", 100 * MS);
+    /// let of_gait = Contract::when_lost("gait").or_late(60 * MS).or_stopped().goes_to("damped", 100 * MS);
     /// let knee = AppSpec::new("knee", || Knee).contract(of_gait);
     /// ```
     #[must_use]

@@ -21,8 +21,8 @@ impl DryRun {
 
 impl<O: Send + 'static> Guard<O> {
     /// Injects a silence into an output that was not armed: after `within` the thread `safe-output` calls the safe
-    /// function, and the time until that has returned is kept. An output that is armed before that is not measured.
-    /// On a virtual clock nothing is measured.
+    /// function, and the time until that has returned is kept. An output that is armed or dropped before that is not
+    /// measured, and the dry run does not call its safe function. On a virtual clock nothing is measured.
     pub(crate) fn begin_dry_run(&self) {
         let shared = self.shared();
         if shared.wake_up.is_some() {
@@ -64,7 +64,7 @@ mod tests {
 
     use super::*;
     use crate::{
-        protection::{ArmError, Protection, outputs},
+        protection::{ArmError, Echo, Flows, Protection, outputs},
         tid::{AppAddress, NodeAddress, Tid},
         wire::Payload,
     };
@@ -80,6 +80,16 @@ mod tests {
         const NAME: &'static str = "test.dry_run.torque";
         const PROTECTION: Option<Protection> =
             Some(Protection { within: WITHIN, ..Protection::of_period(Duration::from_millis(10)) });
+    }
+
+    /// Its dry run does not end during a test.
+    #[derive(serde::Serialize, serde::Deserialize)]
+    struct Level;
+
+    impl Payload for Level {
+        const NAME: &'static str = "test.dry_run.level";
+        const PROTECTION: Option<Protection> =
+            Some(Protection { good_min: 1, ..Protection::of_period(Duration::from_secs(3_600)) });
     }
 
     fn measured(receiver: Tid) -> Option<Duration> {
@@ -125,5 +135,43 @@ mod tests {
         }
         assert_eq!(guard.state(), State::Safe(Cause::NotArmed));
         assert_eq!(measured(tid(2)), None);
+    }
+
+    #[test]
+    fn arming_ends_the_dry_run() {
+        // Given
+        let tid = |app| Tid::new(NodeAddress::new(73), AppAddress::new(app));
+        let guard = Guard::new::<Level>(tid(1), tid(2), (), |(), _| {}).expect("there is the thread");
+        guard.begin_dry_run();
+        assert!(matches!(guard.arm(), Err(ArmError::NotGood { .. })));
+        assert!(guard.shared().lock().dry_run.is_some(), "an attempt to arm it changes nothing");
+        let now = Time::from_nanos(5);
+        let flows = Flows::new(now);
+        // An echo is for a flow that exists.
+        let _ = flows.seal(tid(1), tid(2), &Level, now);
+        flows.record_echo(tid(2), Echo::new(Level::KIND, guard.guarded().echo()));
+        let sealed = flows.seal(tid(1), tid(2), &Level, now).expect("one flow");
+        let _ = guard.guarded().take(&sealed, Some);
+        // When
+        guard.arm().expect("one good command is enough");
+        // Then
+        assert!(guard.shared().lock().dry_run.is_none());
+        assert_eq!((guard.state(), measured(tid(2))), (State::Live, None));
+        guard.trip();
+        assert_eq!(guard.state(), State::Safe(Cause::Tripped));
+        assert_eq!(guard.shared().lock().deadline(), u64::MAX, "it does not begin again");
+    }
+
+    #[test]
+    fn dropping_the_guard_ends_its_dry_run() {
+        let tid = |app| Tid::new(NodeAddress::new(74), AppAddress::new(app));
+        let guard = Guard::new::<Level>(tid(1), tid(2), (), |(), _| {}).expect("there is the thread");
+        guard.begin_dry_run();
+        // An application's context keeps such a part of a dropped guard.
+        let kept = guard.shared().clone();
+        assert!(kept.lock().deadline() < u64::MAX);
+        drop(guard);
+        assert!(kept.lock().dry_run.is_none());
+        assert_eq!(kept.watch.deadline.load(Ordering::Acquire), u64::MAX);
     }
 }

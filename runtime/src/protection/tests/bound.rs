@@ -25,6 +25,34 @@ fn oldest_good_command_reaches_the_bound() {
     assert_eq!(bench.receiver.state(), State::Safe(Cause::Silent));
 }
 
+/// Why a contract cannot tolerate less lateness than `age_max`.
+#[test]
+fn commands_that_are_all_late_keep_the_output_live() {
+    // Given: a link that delays each command by half of the maximum age, with an echo each quarter of it
+    let protection = Protection { within: 4 * MS, age_max: 40 * MS, good_min: 1, ..PROTECTION };
+    let mut bench = Bench::of(protection);
+    let mut on_the_way = VecDeque::new();
+    for step in 0..400 {
+        // When: one is sent each millisecond
+        bench.now = bench.now + MS;
+        if step % 10 == 0 {
+            let at = bench.receiver.echo(bench.now);
+            bench.flows.record_echo(tid(DRIVE), Echo::new(Torque::KIND, at));
+        }
+        on_the_way.push_back((bench.now + protection.age_max / 2, bench.seal()));
+        while let Some((_, command)) = on_the_way.pop_front_if(|(arrives, _)| *arrives <= bench.now) {
+            let _ = bench.take(&command);
+        }
+        bench.receiver.expire(bench.now);
+        match step {
+            0..100 => {}
+            100 => bench.receiver.arm(bench.now).expect("they are good"),
+            // Then
+            _ => assert_eq!(bench.receiver.state(), State::Live, "step {step}"),
+        }
+    }
+}
+
 proptest! {
     /// For any limits and delays, and an application that always arms its output, no output is live at the bound.
     #[test]

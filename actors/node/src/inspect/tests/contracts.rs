@@ -41,7 +41,7 @@ impl Bench {
 }
 
 fn knee() -> DynApp {
-    let of_gait = Contract::when_lost("gait").or_late(10 * MS).goes_to("damped", 200 * MS);
+    let of_gait = Contract::when_lost("gait").or_late(60 * MS).goes_to("damped", 200 * MS);
     let of_node = Contract::when_stopped(Subject::node("central")).goes_to("damped", 300 * MS).through("hip");
     AppSpec::new("knee", || Knee)
         .requires(["gait"])
@@ -66,7 +66,7 @@ fn contracts_are_reported_until_their_application_is_removed() {
     let report = bench.contracts();
     assert_eq!((report.slack_us, report.detection_us, report.dry_run), (2_000, 500_000, false));
     let [of_gait, of_node] = &report.contracts[..] else { panic!("{report:?}") };
-    assert_eq!((of_gait.lost, of_gait.late_us, of_gait.stopped), (true, Some(10_000), false));
+    assert_eq!((of_gait.lost, of_gait.late_us, of_gait.stopped), (true, Some(60_000), false));
     assert_eq!((of_gait.turn_us, of_gait.within_us), (Some(30_000), 200_000));
     assert_eq!((of_node.stopped, of_node.turn_us, of_node.through.as_deref()), (true, None, Some("hip")));
     bench.state.contracts.remove(tid.app);

@@ -18,9 +18,13 @@ use crate::robot::edges::{Arm, GAIT};
 /// the node's slack. Only a network that delays commands by as much as they may be old makes it that long.
 const DAMPED_WITHIN: Duration = Duration::from_millis(100);
 
-/// Returns the drive's contract with central. A command is late as soon as it is too old for a new torque.
+/// Age of central's newest command from which the guard accepts none: `age_max` of [`GaitState`]. A younger one may be
+/// too old for a new torque, but the guard stays open.
+const TOO_OLD: Duration = Duration::from_millis(60);
+
+/// Returns the drive's contract with central.
 pub(super) fn contract() -> Contract {
-    Contract::when_lost(GAIT).or_late(SILENCE_MAX).or_stopped().goes_to("damped", DAMPED_WITHIN)
+    Contract::when_lost(GAIT).or_late(TOO_OLD).or_stopped().goes_to("damped", DAMPED_WITHIN)
 }
 
 /// The commands of central.
@@ -130,5 +134,53 @@ impl CentralCommands {
         // The device may be in a ramp to zero.
         let _ = self.guard.apply(|output| output.gives = true);
         Armed::Now
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use sinew::contracts::{Closure, CommandedOutput, ContractReport, ContractsReport};
+    use sinew::prelude::{AppAddress, NodeAddress, NodeConfig, Payload};
+
+    use super::*;
+
+    fn micros(time: Duration) -> u64 {
+        u64::try_from(time.as_micros()).expect("less than a minute")
+    }
+
+    /// The output of a drive for commands of this type.
+    fn output<P: Payload>(drive: Tid) -> CommandedOutput {
+        let protection = P::PROTECTION.expect("it is protected");
+        CommandedOutput {
+            receiver: drive,
+            receiver_name: Some("knee.drive".to_owned()),
+            sender: Tid::new(NodeAddress::new(1), AppAddress::new(0x1001)),
+            sender_name: Some(GAIT.to_owned()),
+            sender_node: Some("central".to_owned()),
+            kind_name: P::NAME.to_owned(),
+            within_us: micros(protection.within),
+            age_max_us: micros(protection.age_max),
+            measured_us: None,
+        }
+    }
+
+    #[test]
+    fn contract_closes_with_both_guards_and_default_settings() {
+        let drive = Tid::new(NodeAddress::new(2), AppAddress::new(0x1001));
+        let config = NodeConfig::new("knee");
+        let closure = Closure::of(&[ContractsReport {
+            node: drive.node,
+            name: config.name.clone(),
+            slack_us: micros(config.contracts.slack),
+            detection_us: 0,
+            dry_run: false,
+            contracts: vec![ContractReport::new(drive, "knee.drive", &contract())],
+            contracts_left_out: 0,
+            outputs: vec![output::<GaitState>(drive), output::<Arm>(drive)],
+            outputs_left_out: 0,
+        }]);
+        assert!(closure.closes(), "{closure:?}");
+        assert_eq!(closure.rows.len(), 3);
+        assert!(closure.rows[0].worst.is_some_and(|worst| worst <= DAMPED_WITHIN), "{closure:?}");
     }
 }
