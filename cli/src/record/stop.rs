@@ -23,8 +23,8 @@ impl StopRequest {
         })
     }
 
-    /// Same as [`listen`](Self::listen), but a terminal that closes (SIGHUP) ends the process at once: the reader of its
-    /// keys does not return any more, as it tries to read behind the end.
+    /// Same as [`listen`](Self::listen), but a terminal that closes (SIGHUP) ends the process at once: the reader of
+    /// its keys does not return any more, as it tries to read behind the end.
     pub(crate) fn listen_on_terminal() -> io::Result<Self> {
         Self::begin(|| {
             let (mut interrupt, mut terminate) =
