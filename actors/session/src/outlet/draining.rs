@@ -222,19 +222,23 @@ impl<S: Socket> WriterState<S> {
         if self.unsent.is_empty() || !self.numbering.has_room() {
             return None;
         }
-        let message = self.unsent.pop()?;
+        let mut message = self.unsent.pop()?;
+        // One look at the clock serves all frames of a turn. The receiver checks the time to live again.
+        let is_expired = message.header.time_to_live_us != 0
+            && message.header.is_expired(*self.checked_at.get_or_insert_with(Time::now));
+        if message.header.kind == Kind::OUTCOME && !is_expired {
+            message = self.with_outcomes_behind(message);
+        }
+        // Outcomes that left with the first one have made room, too.
         if self.unsent.is_awaited() {
             deferred.room.extend(self.unsent.room_made());
         }
-        // One look at the clock serves all frames of a turn. The receiver checks the time to live again.
-        if message.header.time_to_live_us != 0
-            && message.header.is_expired(*self.checked_at.get_or_insert_with(Time::now))
-        {
+        if is_expired {
             self.receipts.remove_waiting(confirming_destination(&message));
             self.expired(message, deferred);
             return None;
         }
-        Some(if message.header.kind == Kind::OUTCOME { self.with_outcomes_behind(message) } else { message })
+        Some(message)
     }
 
     /// Combines an outcome with those behind it.
