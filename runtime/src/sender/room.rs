@@ -191,7 +191,7 @@ impl<'a, C: Content> RoomBuilder<&'a Sender, C> {
 
     /// Sends the message when there is room, and requests a confirmation. The returned future ends with the
     /// [`Confirmation`], which is the outcome as of [`MessageBuilder::confirmed`]. Its time `within` counts from the
-    /// first attempt.
+    /// first attempt. The message lives no longer, so that `within` limits the wait for room as well.
     ///
     /// # Errors
     /// Those of [`send`](Self::send), and [`SendError::TooManyWaits`].
@@ -325,7 +325,7 @@ impl<S: Borrow<Sender>> Waiting<S> {
         self.until = None;
         let destination = sender.absolute(header.destination);
         let error = StalledError { destination, waited: waits, queue: sender.queue_of(destination) };
-        sender.shared.router.refuse(SubmitError::new(message, Rejection::QueueFull));
+        sender.shared.router.give_up(message);
         Poll::Ready(Err(error.into()))
     }
 }
