@@ -41,8 +41,8 @@ impl Router {
 
     /// Same as [`send`](Self::send), to one application and for a sender that keeps the message after a full queue.
     /// `room` is woken for that as in [`MessageSink::offer`](super::MessageSink::offer), and such a rejection is not
-    /// counted: the caller [gives the message up](Self::give_up) in the end. Any other one must be
-    /// [reported](Self::refuse). The message is no request, of which a guard would have to know.
+    /// counted. Any other one must be [reported](Self::refuse). The message is no request, of which a guard would have to
+    /// know.
     ///
     /// # Errors
     /// The message, and the reason of the rejection.
@@ -69,17 +69,6 @@ impl Router {
             None => offer(message),
             Some(tap) => tap::hand_over(&**tap, message, true, offer),
         }
-    }
-
-    /// Gives up a message that found no room in time: counts it, settles it and shows it to the tap as rejected.
-    pub(crate) fn give_up(&self, message: Message) {
-        let refuse = |message| Err(SubmitError::new(message, Rejection::QueueFull));
-        let refused = match &self.snapshot.load().table.tap {
-            None => refuse(message),
-            Some(tap) => tap::hand_over(&**tap, message, false, refuse),
-        };
-        // The owner of the receipt is notified of the reason.
-        let _ = self.account(refused);
     }
 }
 

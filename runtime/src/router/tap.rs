@@ -126,7 +126,7 @@ impl ObservedMessage {
 }
 
 /// Hands a message to one sink, and reports it to the observer. A message that is rejected for lack of room
-/// and will be offered again (`is_offer`) is reported at that later time, or when it is given up.
+/// and will be offered again is reported at that later time.
 #[cold]
 pub(super) fn hand_over(
     tap: &dyn Tap,
@@ -172,7 +172,7 @@ pub(super) fn saw_one_of_many(
 
 #[cfg(test)]
 mod tests {
-    use std::{sync::Mutex, task::Waker};
+    use std::sync::Mutex;
 
     use super::*;
     use crate::{
@@ -288,16 +288,6 @@ mod tests {
         again.header.kind = Kind::named("test.any");
         router.offer(again, None).expect("it is taken");
         assert_eq!(*lock(&notes.0), [(Way::In, Kind::named("test.any"), None)]);
-    }
-
-    #[test]
-    fn message_given_up_is_seen_once_as_rejected() {
-        let (router, notes) = router();
-        let kept = router.send_or_keep(message(FULL, WATCHED, OTHER), Waker::noop()).expect_err("it is full");
-        assert!(lock(&notes.0).is_empty(), "it is offered again");
-        router.give_up(kept.message);
-        assert_eq!(*lock(&notes.0), [(Way::Out, FULL, Some(Rejection::QueueFull))]);
-        assert_eq!(router.refused_because(), [(Rejection::QueueFull, 1)]);
     }
 
     #[test]

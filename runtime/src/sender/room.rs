@@ -301,7 +301,7 @@ impl<S: Borrow<Sender>> Waiting<S> {
         }
     }
 
-    /// Keeps the message until its next offer, or gives it up at the deadline.
+    /// Keeps the message until its next offer, or makes the last attempt at the deadline.
     fn poll_deadline(&mut self, message: Message, cx: &mut Context<'_>) -> Poll<Result<Time, SendError>> {
         let sender: &Sender = self.sender.borrow();
         let header = &message.header;
@@ -323,10 +323,15 @@ impl<S: Borrow<Sender>> Waiting<S> {
             return Poll::Pending;
         }
         self.until = None;
-        let destination = sender.absolute(header.destination);
-        let error = StalledError { destination, waited: waits, queue: sender.queue_of(destination) };
-        sender.shared.router.give_up(message);
-        Poll::Ready(Err(error.into()))
+        let (destination, sent) = (sender.absolute(header.destination), header.sent);
+        // The last attempt is a send like any other: a refusal is counted by the queue, and seen by the tap.
+        Poll::Ready(match sender.shared.router.send(message) {
+            Ok(()) => Ok(sent),
+            Err(Rejection::QueueFull) => {
+                Err(StalledError { destination, waited: waits, queue: sender.queue_of(destination) }.into())
+            }
+            Err(why) => Err(why.into()),
+        })
     }
 }
 

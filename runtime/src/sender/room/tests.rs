@@ -152,6 +152,7 @@ fn deadline_names_the_queue_that_had_no_room() {
     let stalled = StalledError { destination: sink(), waited: SECOND, queue: StalledQueue::Application };
     assert_eq!(world.poll(&mut sent), Poll::Ready(Err(stalled.into())));
     assert_eq!(world.router.refused_because(), [(Rejection::QueueFull, 1)]);
+    assert_eq!(world.mailbox.tally(Class::Bulk).refused, 1, "the queue has refused it once");
     assert!(stalled.to_string().contains("no room within 1s"), "{stalled}");
 }
 
