@@ -25,9 +25,9 @@ const WRITES_PER_WAKE: usize = 64;
 /// Bytes that the drain task writes before it yields.
 const BYTES_PER_WAKE: usize = 64 << 10;
 
-/// Queued bytes of short frames at which a sender writes them itself, all at once: nearly as many as a receiver reads in
-/// a turn. A write has a fixed cost at both ends, for the system call and perhaps a wake. Meanwhile other senders and
-/// acknowledgements of the connection wait for the lock, for as long as a piece of a long frame takes.
+/// Queued bytes of short frames at which a sender writes them itself, all at once: nearly as many as a receiver reads
+/// in a turn. A write has a fixed cost at both ends, for the system call and perhaps a wake. Meanwhile other senders
+/// and acknowledgements of the connection wait for the lock, for as long as a piece of a long frame takes.
 const HELP_AT_BYTES: usize = 60 << 10;
 /// Queued messages at which a sender writes them itself, however short they are.
 const HELP_AT: usize = 128;

@@ -30,8 +30,8 @@ impl<S: Socket> MessageSink for SocketWriter<S> {
 }
 
 impl<S: Socket> SocketWriter<S> {
-    /// Submits a message. Calls `or` if it is refused, under the same lock: room that is made after the refusal finds the
-    /// sender registered.
+    /// Submits a message. Calls `or` if it is refused, under the same lock: room that is made after the refusal finds
+    /// the sender registered.
     #[inline]
     fn submit_or(
         &self,
