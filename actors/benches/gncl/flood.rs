@@ -78,7 +78,7 @@ pub(crate) struct Cost {
     pub(crate) cpu_there: Duration,
 }
 
-/// The begin of a flood at its sender.
+/// The start of a flood at its sender.
 #[derive(Clone, Copy, Debug)]
 struct Begin {
     at: Instant,

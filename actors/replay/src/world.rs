@@ -3,6 +3,7 @@
 use std::{
     collections::{BTreeMap, BTreeSet, VecDeque},
     sync::{Arc, Mutex},
+    task::Waker,
     time::Duration,
 };
 
@@ -10,7 +11,7 @@ use sinew_runtime::{
     clock::Clock,
     lock,
     mailbox::Mailbox,
-    outcome::{Outcome, Receipt, Ticket},
+    outcome::{Outcome, Receipt, Rejection, Ticket},
     pending::AppSink,
     router::{MessageSink, SubmitError},
     tid::{AppAddress, NodeAddress, Tid},
@@ -182,7 +183,7 @@ impl MessageSink for World {
     /// Accepts a message of an application under test.
     fn submit(&self, mut message: Message) -> Result<(), SubmitError> {
         let (header, now) = (message.header, self.clock.now());
-        if header.flags.has(Flags::KEEP) && message.payload.is_empty() {
+        if is_removal(&message) {
             // As in a node, the removal of a retained value reaches no member and no recording. spec: FRAME-8.3
             message.settle(Outcome::Delivered);
             return Ok(());
@@ -193,11 +194,7 @@ impl MessageSink for World {
             if state.is_over {
                 return Ok(());
             }
-            let is_expected = self.turns.is_none_or(|kind| kind == header.kind);
-            if let Some(rest) = state.expected.get_mut(&header.source).filter(|_| is_expected) {
-                *rest = rest.saturating_sub(1);
-            }
-            state.outputs.push(TimedMessage::new(now, &header, message.payload.clone()));
+            state.note(TimedMessage::new(now, &header, message.payload.clone()), self.turns);
             let receivers = state.named_receivers(destination, header.source);
             // The receipt of a message to one application under test travels with it.
             let stays = receivers.is_empty() || !destination.is_single();
@@ -223,13 +220,49 @@ impl MessageSink for World {
         Ok(())
     }
 
+    /// Notes a message that waits for room when it is accepted, not at each attempt. After a latency none waits: its
+    /// refusal comes too late for its sender.
+    fn offer(&self, message: Message, room: Option<&Waker>) -> Result<(), SubmitError> {
+        let sink = if self.latency.is_zero() && !is_removal(&message) {
+            lock(&self.state).receiver(message.header.destination)
+        } else {
+            None
+        };
+        let Some(sink) = sink else { return self.submit(message) };
+        let output = TimedMessage::new(self.clock.now(), &message.header, message.payload.clone());
+        let offered = sink.offer(message, room);
+        if offered.as_ref().err().is_none_or(|refused| refused.why != Rejection::QueueFull) {
+            lock(&self.state).note(output, self.turns);
+        }
+        offered
+    }
+
     fn cancel(&self, ticket: Ticket) -> bool {
         let sink = lock(&self.state).apps.get(&ticket.destination).cloned();
         sink.is_some_and(|sink| sink.cancel(ticket))
     }
 }
 
+/// Returns whether the message removes a retained value.
+fn is_removal(message: &Message) -> bool {
+    message.header.flags.has(Flags::KEEP) && message.payload.is_empty()
+}
+
 impl State {
+    /// Notes a message of an application under test, and that a check need not expect it any more.
+    fn note(&mut self, output: TimedMessage, turns: Option<Kind>) {
+        let is_expected = turns.is_none_or(|kind| kind == output.kind);
+        if let Some(rest) = self.expected.get_mut(&output.source).filter(|_| is_expected) {
+            *rest = rest.saturating_sub(1);
+        }
+        self.outputs.push(output);
+    }
+
+    /// Returns the one application under test that a message reaches; `None` after the end of the replay.
+    fn receiver(&self, to: Tid) -> Option<Arc<AppSink<Mailbox>>> {
+        if self.is_over { None } else { self.apps.get(&to).cloned() }
+    }
+
     /// Returns the applications under test that a message reaches, without its sender.
     fn named_receivers(&self, to: Tid, from: Tid) -> Vec<(Tid, Arc<AppSink<Mailbox>>)> {
         let named = |tid: &Tid| Some((*tid, self.apps.get(tid)?.clone()));

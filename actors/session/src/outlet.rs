@@ -36,6 +36,7 @@ mod outstanding;
 mod partial;
 mod progress;
 mod queue;
+mod sink;
 mod socket;
 #[cfg(test)]
 mod tests;
@@ -49,13 +50,12 @@ use std::{
         Arc, Mutex, MutexGuard, PoisonError, TryLockError,
         atomic::{AtomicU32, AtomicU64, Ordering},
     },
-    task::Waker,
 };
 
 use sinew_runtime::{
     mailbox::Budget,
     outcome::{Outcome, Rejection, Ticket},
-    router::{MessageSink, SubmitError},
+    router::SubmitError,
     time::Time,
     wire::Message,
 };
@@ -72,7 +72,6 @@ pub use outcomes::{OUTCOMES_MAX, read as read_outcomes};
 use outstanding::{OUTCOME_GRACE, Open};
 pub use progress::Taking;
 pub use socket::{Account, Socket};
-use unsent::Bound;
 pub use unsent::{backlog_key, destination_of};
 use writer_state::{Step, WriterState};
 
@@ -468,31 +467,5 @@ impl<S: Socket> SocketWriter<S> {
     /// Locks the state. No section under this lock can panic halfway, so the state is always consistent.
     fn lock(&self) -> MutexGuard<'_, WriterState<S>> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-}
-
-impl<S: Socket> MessageSink for SocketWriter<S> {
-    fn submit(&self, message: Message) -> Result<(), SubmitError> {
-        // Not by a closure, which would move the message twice more.
-        let (mut state, mut deferred) = (self.lock(), DeferredActions::default());
-        let submitted = state.submit(message, Bound::Kept, &mut deferred);
-        self.end_step(state, deferred);
-        let mut step = submitted?;
-        while step == Step::More {
-            step = self.with(|state, deferred| state.write_on(deferred));
-        }
-        Ok(())
-    }
-
-    fn offer(&self, message: Message, room: Option<&Waker>) -> Result<(), SubmitError> {
-        let Err(refused) = self.submit(message) else { return Ok(()) };
-        if refused.why == Rejection::QueueFull {
-            self.with(|state, deferred| state.undo_refusal(&refused.message, room, deferred));
-        }
-        Err(refused)
-    }
-
-    fn cancel(&self, ticket: Ticket) -> bool {
-        self.with(|state, deferred| state.cancel(ticket, deferred))
     }
 }

@@ -7,11 +7,12 @@ const ACK_EVERY: usize = 32;
 /// Received bytes of frames after which an ACK is sent.
 const ACK_EVERY_BYTES: usize = 64 << 10;
 
-/// Most messages after which an ACK does not wait any longer until nothing more has arrived.
+/// Unacknowledged messages at which an ACK is sent even while more frames have arrived.
 const ACK_LATEST: usize = 128;
-/// Bytes of frames for the same.
+/// Bytes of unacknowledged frames at which it is sent then.
 const ACK_LATEST_BYTES: usize = 256 << 10;
-/// Part of the announced room for the same: the sender has the rest while the ACK is on its way.
+/// Divisor of the announced room that gives lower such bounds if the room is small. The sender has the rest of the room
+/// while the ACK is on its way.
 const LATEST_PART: usize = 8;
 
 /// How to handle a numbered frame.
@@ -115,7 +116,7 @@ impl Receiving {
     }
 
     /// Whether a due ACK must be sent even while more messages have arrived already. Until then it can wait for
-    /// them: a sender that has no room left sends nothing more, so that this wait ends.
+    /// them. A sender that has no room left sends nothing more: the reader then finds no more bytes, and sends it.
     pub fn is_ack_overdue(&self) -> bool {
         let (due, room) = (self.due(), self.room.unwrap_or_default());
         self.reaches(Window {

@@ -9,6 +9,7 @@ use super::{Router, SubmitError, offer_to, tap};
 use crate::{WakerList, outcome::Rejection, tid::Tid, wire::Message};
 
 /// Maximum number of messages of a node that wait for room at the same time. A queue keeps the wakers of all of them.
+/// The thread that makes room wakes them one after the other, which delays it by as many wakes.
 const ROOM_WAITS_MAX: usize = 1_024;
 const _: () = assert!(ROOM_WAITS_MAX < WakerList::MAX);
 
@@ -40,7 +41,8 @@ impl Router {
 
     /// Same as [`send`](Self::send), to one application and for a sender that keeps the message after a full queue.
     /// `room` is woken for that as in [`MessageSink::offer`](super::MessageSink::offer), and such a rejection is not
-    /// counted. Any other one must be [reported](Self::refuse).
+    /// counted. Any other one must be [reported](Self::refuse). The message is no request, of which a guard would
+    /// have to know.
     ///
     /// # Errors
     /// The message, and the reason of the rejection.

@@ -191,7 +191,7 @@ impl<'a, C: Content> RoomBuilder<&'a Sender, C> {
 
     /// Sends the message when there is room, and requests a confirmation. The returned future ends with the
     /// [`Confirmation`], which is the outcome as of [`MessageBuilder::confirmed`]. Its time `within` counts from the
-    /// first attempt.
+    /// first attempt. The message lives no longer, so that `within` limits the wait for room as well.
     ///
     /// # Errors
     /// Those of [`send`](Self::send), and [`SendError::TooManyWaits`].
@@ -301,7 +301,7 @@ impl<S: Borrow<Sender>> Waiting<S> {
         }
     }
 
-    /// Keeps the message until its next offer, or gives it up at the deadline.
+    /// Keeps the message until its next offer, or makes the last attempt at the deadline.
     fn poll_deadline(&mut self, message: Message, cx: &mut Context<'_>) -> Poll<Result<Time, SendError>> {
         let sender: &Sender = self.sender.borrow();
         let header = &message.header;
@@ -323,10 +323,15 @@ impl<S: Borrow<Sender>> Waiting<S> {
             return Poll::Pending;
         }
         self.until = None;
-        let destination = sender.absolute(header.destination);
-        let error = StalledError { destination, waited: waits, queue: sender.queue_of(destination) };
-        sender.shared.router.refuse(SubmitError::new(message, Rejection::QueueFull));
-        Poll::Ready(Err(error.into()))
+        let (destination, sent) = (sender.absolute(header.destination), header.sent);
+        // The last attempt is a send like any other: a refusal is counted by the queue, and seen by the tap.
+        Poll::Ready(match sender.shared.router.send(message) {
+            Ok(()) => Ok(sent),
+            Err(Rejection::QueueFull) => {
+                Err(StalledError { destination, waited: waits, queue: sender.queue_of(destination) }.into())
+            }
+            Err(why) => Err(why.into()),
+        })
     }
 }
 

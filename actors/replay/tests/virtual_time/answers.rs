@@ -104,6 +104,52 @@ fn recorded_outcomes_settle_confirmed_messages() {
     assert_eq!(notes(&to_log), wanted([(1, "2: Delivered"), (2, "1: Expired"), (5, "3: Unknown")]));
 }
 
+/// Notes of a flood: many times as many as a mailbox of a replay has room for.
+const FLOOD: u32 = 5_000;
+
+/// Sends notes to the knee as fast as it takes them.
+struct Flooder;
+
+impl Actor for Flooder {
+    type Context = AppContext<Self>;
+
+    fn started(&mut self, ctx: &mut Self::Context) {
+        let sender = ctx.sender();
+        let flood = async move {
+            for number in 0..FLOOD {
+                let note = Note { text: number.to_string() };
+                sender.message(tid(KNEE), &note).room_within(Duration::from_secs(1)).send().await.unwrap();
+            }
+        };
+        ctx.spawn(flood.into_actor(self));
+    }
+}
+
+/// Takes notes.
+struct Reader;
+
+impl Actor for Reader {
+    type Context = AppContext<Self>;
+}
+
+impl Handler<Delivery<Note>> for Reader {
+    type Result = ();
+
+    fn handle(&mut self, _: Delivery<Note>, _: &mut Self::Context) {}
+}
+
+#[test]
+fn flood_that_waits_for_room_takes_no_time_and_is_noted_once() {
+    let both =
+        replay().app(AppSpec::new("hip", || Flooder)).app(AppSpec::new("knee", || Reader).handles::<Note>());
+    let outputs = both.ends_at(ms(9)).run([]).unwrap();
+    assert!(outputs.iter().map(text).eq((0..FLOOD).map(|number| number.to_string())));
+    assert!(
+        outputs.iter().all(|output| output.at == outputs[0].at),
+        "each wait ends with a wake, not at its deadline"
+    );
+}
+
 /// Joins a group, and notes the angles there.
 struct Member;
 

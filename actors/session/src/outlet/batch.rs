@@ -29,7 +29,8 @@ const RIGHT_BEHIND: Duration = Duration::from_micros(2);
 /// Pause after which a bursting sender may write one message at once: an interrupted burst continues.
 const PAUSE: Duration = Duration::from_micros(50);
 /// Bytes that are gathered before they are written: the amount that a sender [writes
-/// itself](super::draining), plus one message. No piece of a frame is longer.
+/// itself](super::draining), plus one message. It is a [piece](Socket::piece_max) of a long frame between nodes, so
+/// that a write holds the outlet's lock no longer than that of a piece.
 const GATHERED_MAX: usize = 64 << 10;
 
 /// Longest frame, in bytes, that is gathered with others rather than written alone.

@@ -25,8 +25,9 @@ const WRITES_PER_WAKE: usize = 64;
 /// Bytes that the drain task writes before it yields.
 const BYTES_PER_WAKE: usize = 64 << 10;
 
-/// Queued bytes of short frames at which a sender writes them itself, all at once: as many as a receiver reads in a
-/// turn. A write has a fixed cost at both ends, for the system call and perhaps a wake.
+/// Queued bytes of short frames at which a sender writes them itself, all at once: nearly as many as a receiver reads
+/// in a turn. A write has a fixed cost at both ends, for the system call and perhaps a wake. Meanwhile other senders
+/// and acknowledgements of the connection wait for the lock, for as long as a piece of a long frame takes.
 const HELP_AT_BYTES: usize = 60 << 10;
 /// Queued messages at which a sender writes them itself, however short they are.
 const HELP_AT: usize = 128;
@@ -222,19 +223,23 @@ impl<S: Socket> WriterState<S> {
         if self.unsent.is_empty() || !self.numbering.has_room() {
             return None;
         }
-        let message = self.unsent.pop()?;
+        let mut message = self.unsent.pop()?;
+        // One look at the clock serves all frames of a turn. The receiver checks the time to live again.
+        let is_expired = message.header.time_to_live_us != 0
+            && message.header.is_expired(*self.checked_at.get_or_insert_with(Time::now));
+        if message.header.kind == Kind::OUTCOME && !is_expired {
+            message = self.with_outcomes_behind(message);
+        }
+        // Outcomes that left with the first one have made room, too.
         if self.unsent.is_awaited() {
             deferred.room.extend(self.unsent.room_made());
         }
-        // One look at the clock serves all frames of a turn. The receiver checks the time to live again.
-        if message.header.time_to_live_us != 0
-            && message.header.is_expired(*self.checked_at.get_or_insert_with(Time::now))
-        {
+        if is_expired {
             self.receipts.remove_waiting(confirming_destination(&message));
             self.expired(message, deferred);
             return None;
         }
-        Some(if message.header.kind == Kind::OUTCOME { self.with_outcomes_behind(message) } else { message })
+        Some(message)
     }
 
     /// Combines an outcome with those behind it.

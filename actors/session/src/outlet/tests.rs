@@ -15,6 +15,7 @@ use futures_util::FutureExt;
 use sinew_runtime::{
     mailbox::About,
     outcome::{Receipt, ReceiptSink},
+    router::MessageSink,
     tid::{AppAddress, NodeAddress, Tid},
     wire::{Checksum, Class, Flags, FrameCodec, Header, Kind},
 };

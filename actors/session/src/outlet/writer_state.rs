@@ -231,13 +231,17 @@ impl<S: Socket> WriterState<S> {
         Ok(())
     }
 
-    /// Undoes the refusal of a message that found no room: its sender keeps it.
+    /// Undoes the refusal of a message that found no room, as its sender keeps it, and registers the sender. Does
+    /// nothing after another refusal.
     pub(super) fn undo_refusal(
         &mut self,
-        message: &Message,
+        SubmitError { message, why }: &SubmitError,
         room: Option<&Waker>,
         deferred: &mut DeferredActions,
     ) {
+        if *why != Rejection::QueueFull {
+            return;
+        }
         self.counters.counts.refused -= 1;
         let Some(room) = room else { return };
         if !confirming_destination(message)

@@ -152,7 +152,33 @@ fn deadline_names_the_queue_that_had_no_room() {
     let stalled = StalledError { destination: sink(), waited: SECOND, queue: StalledQueue::Application };
     assert_eq!(world.poll(&mut sent), Poll::Ready(Err(stalled.into())));
     assert_eq!(world.router.refused_because(), [(Rejection::QueueFull, 1)]);
+    assert_eq!(world.mailbox.tally(Class::Bulk).refused, 1, "the queue has refused it once");
     assert!(stalled.to_string().contains("no room within 1s"), "{stalled}");
+}
+
+#[test]
+fn deadline_names_the_first_queue_of_each_path() {
+    let time = VirtualTime::starting_at(Time::from_nanos(1_000));
+    let far = Tid::new(NodeAddress::new(0x7f00_0002), SINK);
+    for queue in [StalledQueue::Peer, StalledQueue::OwnNode] {
+        let mailbox = Mailbox::on_clock(time.clock(), 1);
+        let router = match queue {
+            StalledQueue::OwnNode => Router::through(NODE, mailbox),
+            StalledQueue::Peer | StalledQueue::Application => {
+                let router = Router::new(NODE);
+                router.set_peer(far.node, mailbox);
+                router
+            }
+        };
+        let pending = Pending::on_clock(time.clock(), 1, 8);
+        let router = Arc::new(router.on_clock(time.clock()));
+        let sender = Sender::new(Tid::new(NODE, SENDER), router, Arc::new(NoNames), pending, 1_000);
+        sender.send(far, &Block(0)).expect("it has room");
+        let mut sent = sender.message(far, &Block(1)).room_within(Duration::ZERO).send();
+        let stalled = StalledError { destination: far, waited: Duration::ZERO, queue };
+        let ended = Pin::new(&mut sent).poll(&mut Context::from_waker(Waker::noop()));
+        assert_eq!(ended, Poll::Ready(Err(stalled.into())));
+    }
 }
 
 #[test]

@@ -16,7 +16,7 @@ fn ticket(correlation: u64) -> Ticket {
 }
 
 /// The outcome of that message.
-fn outcome(correlation: u64) -> Message {
+pub(super) fn outcome(correlation: u64) -> Message {
     Message::outcome(ticket(correlation), Outcome::Delivered)
 }
 
@@ -34,7 +34,7 @@ fn outlet<S: Socket>(frame: Option<Kind>) -> SocketWriter<S> {
 }
 
 /// The same, with a wire that accepts nothing yet.
-fn bench(frame: Option<Kind>, payload_max: usize) -> Bench {
+pub(super) fn bench(frame: Option<Kind>, payload_max: usize) -> Bench {
     let outlet = outlet(frame);
     let wire = Arc::new(Wire::default());
     let link = outlet.connect(wire.clone(), payload_max, None);

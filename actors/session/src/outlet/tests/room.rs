@@ -2,7 +2,11 @@
 
 use std::task::Wake;
 
-use super::{requests::session, *};
+use super::{
+    outcomes::{bench as bench_of_outcomes, outcome},
+    requests::session,
+    *,
+};
 
 /// Counts how often its waker was woken.
 #[derive(Default)]
@@ -133,6 +137,19 @@ fn sender_is_woken_when_queued_messages_expire() {
     (0..4).for_each(|value| bench.submit(expiring(Class::Bulk, value)));
     bench.outlet.offer(message(Class::Bulk, 4), Some(&waker)).unwrap_err();
     bench.outlet.expire(Time::now() + Duration::from_secs(61));
+    assert_eq!(woken.0.load(Ordering::Relaxed), 1);
+}
+
+#[test]
+fn sender_is_woken_when_combined_outcomes_leave_the_queue() {
+    // Given: a queue that outcomes have filled, which leave together. Without the first one it is not half empty.
+    let (bench, (woken, waker)) = (bench_of_outcomes(Some(Kind::GNCL_OUTCOMES), usize::MAX), waker());
+    (1..=4).for_each(|correlation| bench.submit(outcome(correlation)));
+    let refused = bench.outlet.offer(message(Class::Control, 5), Some(&waker)).unwrap_err();
+    assert_eq!((refused.why, woken.0.load(Ordering::Relaxed)), (Rejection::QueueFull, 0));
+    // When, then
+    bench.make_room(PLENTY);
+    assert_eq!(frames(&bench.wire.bytes.lock().unwrap()).len(), 1);
     assert_eq!(woken.0.load(Ordering::Relaxed), 1);
 }
 
