@@ -95,9 +95,9 @@ pub enum ParameterError {
         "a transaction names 1 to {PARTICIPANTS_MAX} applications, each once, and the receiver among them"
     )]
     Participants,
-    /// The clock of the sender's host is not measured yet, so that the stated time is not known here.
+    /// The clock of the sender's host is not measured yet, or not well enough: its error is above an eighth of the lead.
     #[error(
-        "the clock of the sender's host is not measured yet, so that the stated time is not known here: send the transaction again in some seconds"
+        "the clock of the sender's host is not known here within an eighth of the lead: send the transaction again in some seconds, or with a longer lead"
     )]
     UnknownClock,
     /// The lead of a transaction is outside of its range. The caller is at fault.

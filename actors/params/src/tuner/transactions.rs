@@ -18,6 +18,10 @@ use crate::{
 /// Maximum number of transactions with a known outcome. The oldest one is forgotten.
 const CONCLUDED_MAX: usize = 16;
 
+/// The largest error of the stated time, as a part of the lead. Between a participant whose clock is late by it and one
+/// whose clock is early by it, a quarter of the lead is left for the result.
+const CLOCK_SHARE: u32 = 8;
+
 /// Time between two looks at whether an application without a next tick can apply agreed values: its timer may have
 /// been cancelled.
 const APPLY_AGAIN: Duration = Duration::from_millis(100);
@@ -161,7 +165,10 @@ impl<T> Tuner<T> {
             return Err(ParameterError::Participants);
         }
         let (sent, bound) = sent.ok_or(ParameterError::UnknownClock)?;
-        let times = times(transaction, sent)?;
+        let times = times(transaction, sent, now)?;
+        if bound > Duration::from_nanos(transaction.lead_ns) / CLOCK_SHARE {
+            return Err(ParameterError::UnknownClock);
+        }
         if now >= times.decide_by {
             return Err(ParameterError::TooLate);
         }
@@ -218,7 +225,7 @@ impl<T> Tuner<T> {
 }
 
 /// Returns the times of a transaction on this clock. Its message was sent at `sent`.
-fn times(transaction: &ParameterTransaction, sent: Duration) -> Result<Times, ParameterError> {
+fn times(transaction: &ParameterTransaction, sent: Duration, now: Duration) -> Result<Times, ParameterError> {
     let lead = Duration::from_nanos(transaction.lead_ns);
     let applies_after = Duration::from_nanos(transaction.applies_after_ns);
     if !(LEAD_MIN..=LEAD_MAX).contains(&lead) || applies_after > lead {
@@ -227,3 +234,7 @@ fn times(transaction: &ParameterTransaction, sent: Duration) -> Result<Times, Pa
     let apply_at = sent.saturating_add(applies_after);
     Ok(Times { decide_by: apply_at.saturating_sub(lead / 2), apply_at })
 }
+    // The sender states the time of sending. A wrong one must not hold the parameters for longer.
+    if apply_at.saturating_sub(now) > LEAD_MAX {
+        return Err(ParameterError::Lead);
+    }

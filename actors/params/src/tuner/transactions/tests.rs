@@ -238,6 +238,10 @@ fn kills_leave_all_or_none() {
         world.judge_end();
         refused += u32::from(world.verdict() == Some(TransactionVerdict::None));
         repaired += u32::from(world.verdict() == Some(TransactionVerdict::Repaired));
+    // An eighth of the lead of 100 ms is 12.5 ms.
+    assert_eq!(refusal(|_| {}, Some((ms(0), ms(13))), ms(1)), ParameterError::UnknownClock);
+    // It says that it was sent in the future.
+    assert_eq!(refusal(|_| {}, Some((ms(2_000), ms(0))), ms(1)), ParameterError::Lead);
     }
     assert!(refused > 50 && repaired > 50, "{refused} without effect, {repaired} repaired");
 }
