@@ -68,6 +68,12 @@ impl Transactions {
         self.current.is_none()
     }
 
+    /// Returns the values that are agreed on and apply soon.
+    fn agreed(&self) -> Option<&Values> {
+        let current = self.current.as_ref().filter(|current| current.is_holding)?;
+        current.agreement.is_committed().then_some(&current.values)
+    }
+
     /// Takes the steps that are due. A result that is not known at the stated time is a refusal.
     fn advance(&mut self, now: Duration) {
         let Some(current) = &mut self.current else { return };
@@ -188,8 +194,25 @@ impl<T> Tuner<T> {
     }
 
     /// Handles a message of the application at `from`, its TID as bits. One that is no participant changes nothing.
-    pub fn on_vote(&mut self, now: Duration, from: u64, vote: ParameterVote) {
+    /// Returns whether a kept parameter has another value after a restart.
+    pub fn on_vote(&mut self, now: Duration, from: u64, vote: ParameterVote) -> bool {
         self.transactions.on_vote(now, from, vote);
+        self.keep_agreed()
+    }
+
+    /// Gives kept parameters their agreed values for a restart: the others apply theirs also if this application is
+    /// killed before its tick. Returns whether one changes.
+    pub(super) fn keep_agreed(&mut self) -> bool {
+        let agreed = self.transactions.agreed().into_iter().flatten();
+        let mut has_changed = false;
+        for &(index, bits) in agreed {
+            let is_kept = self.set.descriptors().get(index).is_some_and(|descriptor| descriptor.keep);
+            if let Some(cell) = self.set.cell(index).filter(|cell| is_kept && cell.kept() != bits) {
+                cell.set_kept(bits);
+                has_changed = true;
+            }
+        }
+        has_changed
     }
 
     /// Returns the next message to another participant: the bits of its TID, and the message. Call it after each other
@@ -232,9 +255,9 @@ fn times(transaction: &ParameterTransaction, sent: Duration, now: Duration) -> R
         return Err(ParameterError::Lead);
     }
     let apply_at = sent.saturating_add(applies_after);
-    Ok(Times { decide_by: apply_at.saturating_sub(lead / 2), apply_at })
-}
     // The sender states the time of sending. A wrong one must not hold the parameters for longer.
     if apply_at.saturating_sub(now) > LEAD_MAX {
         return Err(ParameterError::Lead);
     }
+    Ok(Times { decide_by: apply_at.saturating_sub(lead / 2), apply_at })
+}
