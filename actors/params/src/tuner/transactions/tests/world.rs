@@ -398,6 +398,19 @@ impl World {
         assert!(values.len() <= 1, "seed {}: {values:?} at the end, {:?}", self.seed, self.verdict);
     }
 
+    /// Checks that the coordinator's answer is true of each node at the end, if there is one.
+    pub(super) fn judge_answer(&self) {
+        let Some(verdict) = self.verdict else { return };
+        let expected = match verdict {
+            TransactionVerdict::All | TransactionVerdict::Repaired => Some(NEW),
+            TransactionVerdict::None => Some(OLD),
+            TransactionVerdict::Mixed => None,
+        };
+        let values: Vec<i64> = self.nodes.iter().map(|node| node.steps.0.get()).collect();
+        let is_true = values.iter().all(|value| Some(*value) == expected);
+        assert!(is_true, "seed {}: the answer is {verdict:?}, and the values are {values:?}", self.seed);
+    }
+
     /// Returns whether the loops of two nodes have read different values after the stated time.
     pub(super) fn was_mixed(&self) -> bool {
         let since = BEGIN + LEAD;
