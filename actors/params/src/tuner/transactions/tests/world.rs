@@ -232,16 +232,20 @@ impl World {
         }
     }
 
-    /// Loses the messages of a killed process that are on their way, to some of their receivers.
+    /// Loses messages of a killed process that are on their way: to each receiver all, none, or the last ones.
     fn lose_messages_of(&mut self, killed: usize) {
-        let mut lost = BTreeSet::new();
+        let latest = self.now + Duration::from_micros(DELAY_MAX_US);
+        let mut until = BTreeMap::new();
         for receiver in (0..self.nodes.len()).chain([COORDINATOR]) {
-            if self.random.below(2) == 0 {
-                lost.insert(receiver);
-            }
+            let last = match self.random.below(3) {
+                0 => self.now,
+                1 => latest,
+                _ => self.random.between(self.now, latest),
+            };
+            until.insert(receiver, last);
         }
-        self.events.retain(|_, event| {
-            !matches!(event, Event::Deliver { from, to, .. } if *from == killed && lost.contains(to))
+        self.events.retain(|(at, _), event| {
+            !matches!(event, Event::Deliver { from, to, .. } if *from == killed && *at > until[to])
         });
     }
 
