@@ -83,6 +83,10 @@ pub(super) async fn set(shared: &Arc<Shared>, given: &[GivenParameter], known: &
         match answer::apply(shared, app.clone(), SetParameters::Values(values)).await {
             Ok(ParameterOutcome::Applied { .. }) => {}
             Ok(ParameterOutcome::Refused { why }) => faults.push(format!("{app}: refused: {why}")),
+            // Only the values of a transaction are held.
+            Ok(ParameterOutcome::Held { .. }) => {
+                faults.push(format!("{app}: it answered with a state of a transaction; update it"));
+            }
             Err(why) => faults.push(format!("{app}: {why}")),
         }
     }
