@@ -101,8 +101,17 @@ fn play_kill(robot: &mut Robot, round: Round, report: &mut Report) {
     let is_new = judge_living(robot, round, report);
     robot.start_node(victim);
     if coordinator == victim {
-        // No coordinator is left to repair: the node has its default, as after each restart.
+        // No coordinator is left to repair: the node begins with the value that it has kept.
         report.coordinators_killed += 1;
+        let restarted = robot.look(victim).value;
+        let has_new = restarted == value;
+        report.claim(is_new != Some(false) || !has_new, || {
+            format!("the restarted node {victim} has kept {restarted}, which no other node has: {round:?}")
+        });
+        if is_new == Some(true) {
+            let count = if has_new { &mut report.kept } else { &mut report.behind };
+            *count += 1;
+        }
         return;
     }
     let answer = robot.answer(coordinator);

@@ -5,12 +5,13 @@ use crate::{
     tuner::{legal_bits, unknown},
 };
 
-/// Returns the kept parameters of a set and the values to which they move. Any thread may call it.
+/// Returns the kept parameters of a set, with the values to which they move after a restart: those to which they move
+/// now, or those of a transaction that is agreed on. Any thread may call it.
 #[must_use]
 pub fn kept_values(set: &dyn Parameters) -> Vec<NamedValue> {
     let kept = set.descriptors().iter().enumerate().filter(|(_, descriptor)| descriptor.keep);
     let values = kept.filter_map(|(index, descriptor)| {
-        let value = descriptor.value_of(set.cell(index)?.target());
+        let value = descriptor.value_of(set.cell(index)?.kept());
         Some(NamedValue { name: descriptor.name.to_owned(), value })
     });
     values.collect()

@@ -24,6 +24,8 @@ pub struct Cell {
     // SYNC: Relaxed; each parameter stands alone, and a reader of several is on the writer's thread.
     value: AtomicU64,
     target: AtomicU64,
+    /// The target after a restart, if the parameter is kept: the present one, or one that a transaction applies soon.
+    kept: AtomicU64,
 }
 
 /// The types of parameters: `f64`, `i64` and `bool`.
@@ -74,8 +76,8 @@ impl<T: ParamType> Param<T> {
     /// Creates a parameter with this value.
     pub fn new(value: T) -> Self {
         let bits = sealed::Bits::to_bits(value);
-        let cell = Cell { value: AtomicU64::new(bits), target: AtomicU64::new(bits) };
-        Self { cell, value_type: PhantomData }
+        let [value, target, kept] = [bits; 3].map(AtomicU64::new);
+        Self { cell: Cell { value, target, kept }, value_type: PhantomData }
     }
 
     /// Returns the current value: one load, without a lock.
@@ -115,6 +117,15 @@ impl Cell {
 
     pub(crate) fn set_target(&self, bits: u64) {
         self.target.store(bits, Ordering::Relaxed);
+        self.set_kept(bits);
+    }
+
+    pub(crate) fn kept(&self) -> u64 {
+        self.kept.load(Ordering::Relaxed)
+    }
+
+    pub(crate) fn set_kept(&self, bits: u64) {
+        self.kept.store(bits, Ordering::Relaxed);
     }
 }
 

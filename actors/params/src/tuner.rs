@@ -95,9 +95,9 @@ pub enum ParameterError {
         "a transaction names 1 to {PARTICIPANTS_MAX} applications, each once, and the receiver among them"
     )]
     Participants,
-    /// The clock of the sender's host is not measured yet, so that the stated time is not known here.
+    /// The clock of the sender's host is not measured yet, or not well enough: its error is above an eighth of the lead.
     #[error(
-        "the clock of the sender's host is not measured yet, so that the stated time is not known here: send the transaction again in some seconds"
+        "the clock of the sender's host is not known here within an eighth of the lead: send the transaction again in some seconds, or with a longer lead"
     )]
     UnknownClock,
     /// The lead of a transaction is outside of its range. The caller is at fault.
@@ -152,10 +152,12 @@ impl<T> Tuner<T> {
     /// Creates the tuner of a new incarnation. Parameters that are not kept get their defaults.
     pub fn new(set: Arc<dyn Parameters>, now: Duration) -> Self {
         for (index, descriptor) in set.descriptors().iter().enumerate() {
-            if let Some(cell) = set.cell(index).filter(|_| !descriptor.keep) {
-                let bits = bits_of(descriptor.default());
+            let Some(cell) = set.cell(index) else { continue };
+            let bits = if descriptor.keep { cell.kept() } else { bits_of(descriptor.default()) };
+            cell.set_target(bits);
+            // A kept value of the former incarnation may have been on its way: it does not jump.
+            if !descriptor.keep || descriptor.slope_per_s().is_none() {
                 cell.set_value(bits);
-                cell.set_target(bits);
             }
         }
         let mut tuner = Self {
@@ -167,7 +169,6 @@ impl<T> Tuner<T> {
             has_kept_change: false,
             transactions: Transactions::default(),
         };
-        // A kept value of the former incarnation may have been on its way.
         tuner.advance(Duration::ZERO);
         tuner
     }
@@ -231,6 +232,7 @@ impl<T> Tuner<T> {
             done(ticket, outcome);
         }
         self.apply_transaction(tick, now);
+        self.has_kept_change |= self.keep_agreed();
         if self.is_moving {
             self.advance(since);
         }

@@ -118,8 +118,14 @@ impl Ways<'_> {
 fn report(of: &TransactionReport) -> Report {
     let mut text: String = of.parts.iter().map(line).collect();
     let count = of.parts.len();
+    let has_unknown = of.parts.iter().any(|part| matches!(part.outcome, PartOutcome::Unknown(_)));
     let (verdict, sentence) = match of.verdict {
         TransactionVerdict::All => ("all", format!("set together: {count} applications\n")),
+        TransactionVerdict::None if has_unknown => (
+            "none",
+            "no application that answers has its values; `sinew param list` shows the others when they can be reached\n"
+                .to_owned(),
+        ),
         TransactionVerdict::None => ("none", "nothing was set\n".to_owned()),
         TransactionVerdict::Repaired => (
             "repaired",
@@ -127,7 +133,7 @@ fn report(of: &TransactionReport) -> Report {
         ),
         TransactionVerdict::Mixed => (
             "mixed",
-            "some have their values, and others do not: `sinew param list` shows them; set them again, or undo the others\n"
+            "some have their values, and others do not, or do not answer: `sinew param list` shows them; set them again, or undo the others\n"
                 .to_owned(),
         ),
     };
@@ -202,6 +208,17 @@ mod tests {
                     time (known within 0.040 ms)\n";
         assert_eq!(report.text, format!("{line}set together: 1 applications\n"));
         assert!(report.is_fine && report.json["apps"][0]["tick"] == json!(7), "{}", report.json);
+    }
+
+    #[test]
+    fn silent_application_may_have_its_values() {
+        let refused = || PartOutcome::Refused("no acceptance".to_owned());
+        let of = |outcome| {
+            report_of(TransactionVerdict::None, vec![part("knee", refused()), part("hip", outcome)])
+        };
+        let (certain, open) = (of(refused()), of(PartOutcome::Unknown("no answer".to_owned())));
+        assert!(certain.text.ends_with("nothing was set\n") && !certain.is_fine, "{}", certain.text);
+        assert!(!open.text.contains("nothing was set") && open.text.contains("param list"), "{}", open.text);
     }
 
     #[test]

@@ -29,7 +29,7 @@ params! {
     /// The parameter of the loop.
     struct Gains {
         /// The number of the last transaction.
-        number: i64 = 0, unit "1", range 0..=1_000_000_000;
+        number: i64 = 0, unit "1", range 0..=1_000_000_000, keep;
     }
 }
 
@@ -49,13 +49,18 @@ impl Actor for Loop {
     type Context = AppContext<Self>;
 
     fn started(&mut self, context: &mut Self::Context) {
-        context.every(PERIOD, |this, _, context| {
-            let value = this.gains.number.get().unsigned_abs();
-            if this.view.value.load(Ordering::SeqCst) != value {
-                this.view.since_ns.store(context.now().as_nanos(), Ordering::SeqCst);
-                this.view.value.store(value, Ordering::SeqCst);
-            }
-        });
+        self.read(context.now().as_nanos());
+        context.every(PERIOD, |this, _, context| this.read(context.now().as_nanos()));
+    }
+}
+
+impl Loop {
+    fn read(&self, now_ns: u64) {
+        let value = self.gains.number.get().unsigned_abs();
+        if self.view.value.load(Ordering::SeqCst) != value {
+            self.view.since_ns.store(now_ns, Ordering::SeqCst);
+            self.view.value.store(value, Ordering::SeqCst);
+        }
     }
 }
 
@@ -76,6 +81,7 @@ pub(crate) fn run(arguments: &[String]) {
             config.ndl.period = Duration::from_millis(100);
             config.rt.probe = Duration::ZERO;
             config.security.access = Some(access.clone());
+            config.state = Some(access.with_file_name("state"));
         });
     let (gains, view) = (Gains::new(), Arc::new(View::default()));
     let (shared, seen) = (gains.clone(), view.clone());

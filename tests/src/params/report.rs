@@ -21,8 +21,12 @@ pub struct Report {
     pub without_effect: u32,
     /// Transactions of which the killed node got the values after its restart.
     pub repaired: u32,
-    /// Transactions without their coordinator, which was killed. The living nodes alone are judged.
+    /// Transactions without their coordinator, which was killed. The living nodes have all applied them, or none.
     pub coordinators_killed: u32,
+    /// Of these, those that the others have applied, and that the coordinator's node had kept before it was killed.
+    pub kept: u32,
+    /// The same, if that node had not kept it: it was killed in the first milliseconds after its acceptance.
+    pub behind: u32,
     /// Transactions in which a node was cut off.
     pub cuts: u32,
     /// Time from the first to the last tick at which living nodes applied a transaction.
@@ -59,7 +63,8 @@ impl Report {
         json!({
             "bench": "params", "seed": self.seed, "rounds": self.rounds, "violations": self.violation_count,
             "complete": self.complete, "without_effect": self.without_effect, "repaired": self.repaired,
-            "coordinators_killed": self.coordinators_killed, "cuts": self.cuts, "spread": self.spread.json(),
+            "coordinators_killed": self.coordinators_killed, "kept": self.kept, "behind": self.behind,
+            "cuts": self.cuts, "spread": self.spread.json(),
         })
     }
 }
@@ -75,6 +80,8 @@ impl fmt::Display for Report {
             ("a node was killed: applied by none", self.without_effect),
             ("a node was killed: repaired after its restart", self.repaired),
             ("the coordinator's node was killed", self.coordinators_killed),
+            ("  and begins with the value of the others", self.kept),
+            ("  and begins with its former value", self.behind),
             ("a node was cut off", self.cuts),
         ];
         for (case, count) in counts {

@@ -18,6 +18,10 @@ use crate::{
 /// Maximum number of transactions with a known outcome. The oldest one is forgotten.
 const CONCLUDED_MAX: usize = 16;
 
+/// The largest error of the stated time, as a part of the lead. Between a participant whose clock is late by it and one
+/// whose clock is early by it, a quarter of the lead is left for the result.
+const CLOCK_SHARE: u32 = 8;
+
 /// Time between two looks at whether an application without a next tick can apply agreed values: its timer may have
 /// been cancelled.
 const APPLY_AGAIN: Duration = Duration::from_millis(100);
@@ -62,6 +66,12 @@ impl Transactions {
 
     pub(super) const fn is_idle(&self) -> bool {
         self.current.is_none()
+    }
+
+    /// Returns the values that are agreed on and apply soon.
+    fn agreed(&self) -> Option<&Values> {
+        let current = self.current.as_ref().filter(|current| current.is_holding)?;
+        current.agreement.is_committed().then_some(&current.values)
     }
 
     /// Takes the steps that are due. A result that is not known at the stated time is a refusal.
@@ -161,7 +171,10 @@ impl<T> Tuner<T> {
             return Err(ParameterError::Participants);
         }
         let (sent, bound) = sent.ok_or(ParameterError::UnknownClock)?;
-        let times = times(transaction, sent)?;
+        let times = times(transaction, sent, now)?;
+        if bound > Duration::from_nanos(transaction.lead_ns) / CLOCK_SHARE {
+            return Err(ParameterError::UnknownClock);
+        }
         if now >= times.decide_by {
             return Err(ParameterError::TooLate);
         }
@@ -181,8 +194,25 @@ impl<T> Tuner<T> {
     }
 
     /// Handles a message of the application at `from`, its TID as bits. One that is no participant changes nothing.
-    pub fn on_vote(&mut self, now: Duration, from: u64, vote: ParameterVote) {
+    /// Returns whether a kept parameter has another value after a restart.
+    pub fn on_vote(&mut self, now: Duration, from: u64, vote: ParameterVote) -> bool {
         self.transactions.on_vote(now, from, vote);
+        self.keep_agreed()
+    }
+
+    /// Gives kept parameters their agreed values for a restart: the others apply theirs also if this application is
+    /// killed before its tick. Returns whether one changes.
+    pub(super) fn keep_agreed(&mut self) -> bool {
+        let agreed = self.transactions.agreed().into_iter().flatten();
+        let mut has_changed = false;
+        for &(index, bits) in agreed {
+            let is_kept = self.set.descriptors().get(index).is_some_and(|descriptor| descriptor.keep);
+            if let Some(cell) = self.set.cell(index).filter(|cell| is_kept && cell.kept() != bits) {
+                cell.set_kept(bits);
+                has_changed = true;
+            }
+        }
+        has_changed
     }
 
     /// Returns the next message to another participant: the bits of its TID, and the message. Call it after each other
@@ -218,12 +248,16 @@ impl<T> Tuner<T> {
 }
 
 /// Returns the times of a transaction on this clock. Its message was sent at `sent`.
-fn times(transaction: &ParameterTransaction, sent: Duration) -> Result<Times, ParameterError> {
+fn times(transaction: &ParameterTransaction, sent: Duration, now: Duration) -> Result<Times, ParameterError> {
     let lead = Duration::from_nanos(transaction.lead_ns);
     let applies_after = Duration::from_nanos(transaction.applies_after_ns);
     if !(LEAD_MIN..=LEAD_MAX).contains(&lead) || applies_after > lead {
         return Err(ParameterError::Lead);
     }
     let apply_at = sent.saturating_add(applies_after);
+    // The sender states the time of sending. A wrong one must not hold the parameters for longer.
+    if apply_at.saturating_sub(now) > LEAD_MAX {
+        return Err(ParameterError::Lead);
+    }
     Ok(Times { decide_by: apply_at.saturating_sub(lead / 2), apply_at })
 }

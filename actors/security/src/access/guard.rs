@@ -17,7 +17,7 @@ use sinew_model::{
 };
 use sinew_runtime::{
     lock,
-    parameters::SetParameters,
+    parameters::{ParameterVote, SetParameters},
     router::guard::Guard,
     tid::{AppAddress, Incarnation, NodeAddress, Tid},
     time::Time,
@@ -431,7 +431,7 @@ struct IncarnationGuard {
 impl Guard for IncarnationGuard {
     fn allows(&self, header: &Header, app: AppAddress) -> bool {
         // The sender of a last will has ended, and nothing is tuned then.
-        if header.kind == SetParameters::KIND {
+        if [SetParameters::KIND, ParameterVote::KIND].contains(&header.kind) {
             return false;
         }
         judge(&self.index, &self.refusals, question(self.here, header, app), header.destination.is_single())

@@ -81,6 +81,13 @@ impl Tuning {
         self.timers.iter().min_by_key(|(period, _)| *period).copied()
     }
 
+    /// Has the kept parameters written.
+    fn write_kept(&self) {
+        if let Some(on_kept) = self.on_kept.get() {
+            on_kept();
+        }
+    }
+
     /// Resumes after a pause.
     pub(super) fn resume(&mut self, now: Time) {
         if let Some(tuner) = &mut self.tuner {
@@ -161,10 +168,12 @@ impl<A: Actor<Context = Self>> AppContext<A> {
 
     /// Handles a message of another participant of a transaction.
     fn take_vote(&mut self, source: Tid, vote: ParameterVote, now: Time) -> Outcome {
-        if let Some(tuner) = &mut self.tuning.tuner {
-            tuner.on_vote(since_origin(now), source.bits(), vote);
-        }
+        let Some(tuner) = &mut self.tuning.tuner else { return Outcome::Delivered };
+        let is_kept_changed = tuner.on_vote(since_origin(now), source.bits(), vote);
         self.send_votes();
+        if is_kept_changed {
+            self.tuning.write_kept();
+        }
         Outcome::Delivered
     }
 
@@ -201,8 +210,8 @@ impl<A: Actor<Context = Self>> AppContext<A> {
         let has_transaction = !tuner.is_idle();
         let is_kept_changed =
             tuner.tick(tick, since_origin(now), |to, outcome| reply(&self.sender, to, &outcome));
-        if let Some(on_kept) = self.tuning.on_kept.get().filter(|_| is_kept_changed) {
-            on_kept();
+        if is_kept_changed {
+            self.tuning.write_kept();
         }
         if has_transaction {
             self.send_votes();

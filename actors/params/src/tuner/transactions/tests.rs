@@ -8,7 +8,7 @@ use self::world::{Plan, World};
 use crate::{
     Cell, Descriptor, Domain, LEAD_MAX, NamedValue, PARTICIPANTS_MAX, Param, ParameterError,
     ParameterOutcome, ParameterTransaction, ParameterVote, Parameters, Participant, SetParameters, Stance,
-    TICK_WITHIN, TransactionId, TransactionVerdict, Tuner, Value,
+    TICK_WITHIN, TransactionId, TransactionVerdict, Tuner, Value, kept_values,
 };
 
 const ID: TransactionId = TransactionId { coordinator: 99, began_ns: 1 };
@@ -17,19 +17,19 @@ const OLD: i64 = 4;
 const NEW: i64 = 9;
 const PERIOD: Duration = ms(10);
 
-struct Steps(Param<i64>);
+struct Steps(Param<i64>, &'static [Descriptor]);
 
-const DESCRIPTORS: [Descriptor; 1] = [Descriptor {
-    name: "steps",
-    description: "",
-    unit: "1",
-    domain: Domain::Integer { default: OLD, min: 1, max: 16 },
-    keep: false,
-}];
+static DESCRIPTORS: [Descriptor; 1] = [descriptor(false)];
+static KEPT: [Descriptor; 1] = [descriptor(true)];
+
+const fn descriptor(keep: bool) -> Descriptor {
+    let domain = Domain::Integer { default: OLD, min: 1, max: 16 };
+    Descriptor { name: "steps", description: "", unit: "1", domain, keep }
+}
 
 impl Parameters for Steps {
     fn descriptors(&self) -> &'static [Descriptor] {
-        &DESCRIPTORS
+        self.1
     }
 
     fn cell(&self, index: usize) -> Option<&Cell> {
@@ -42,7 +42,7 @@ const fn ms(ms: u64) -> Duration {
 }
 
 fn steps() -> Arc<Steps> {
-    Arc::new(Steps(Param::new(OLD)))
+    Arc::new(Steps(Param::new(OLD), &DESCRIPTORS))
 }
 
 fn values(steps: i64) -> Vec<NamedValue> {
@@ -178,6 +178,38 @@ fn other_set_ends_a_doubt() {
 }
 
 #[test]
+fn restart_before_the_tick_begins_with_the_agreed_value() {
+    let steps = Arc::new(Steps(Param::new(OLD), &KEPT));
+    let mut tuner: Tuner<u32> = Tuner::new(steps.clone(), ms(0));
+    // A set that waits when the transaction begins is applied before it.
+    tuner.stage(&SetParameters::Values(values(5)), (1, ms(0) + TICK_WITHIN), true).expect("it is legal");
+    prepare(&mut tuner, &transaction(2), ms(1)).expect("it is legal");
+    assert_eq!(kept_values(&*steps), values(OLD));
+    let accepts = ParameterVote { transaction: ID, stance: Stance::Accepts };
+    assert!(tuner.on_vote(ms(2), 2, accepts) && !tuner.on_vote(ms(3), 2, accepts));
+    assert!(tuner.tick((1, PERIOD), ms(10), |_, _| {}));
+    assert_eq!((steps.0.get(), kept_values(&*steps)), (5, values(NEW)));
+    drop(tuner);
+    let next: Tuner<u32> = Tuner::new(steps.clone(), ms(40));
+    assert_eq!((steps.0.get(), steps.0.target(), next.is_idle()), (NEW, NEW, true));
+}
+
+#[test]
+fn kept_value_stays_if_nothing_is_agreed_on() {
+    let steps = Arc::new(Steps(Param::new(OLD), &KEPT));
+    let mut tuner: Tuner<u32> = Tuner::new(steps.clone(), ms(0));
+    prepare(&mut tuner, &transaction(3), ms(1)).expect("it is legal");
+    vote(&mut tuner, ms(2), 2, Stance::Accepts);
+    tick(&mut tuner, 9, ms(100));
+    // It learns late that all had accepted, but another set comes before its next tick.
+    vote(&mut tuner, ms(101), 2, Stance::Commits);
+    assert_eq!(kept_values(&*steps), values(OLD));
+    tuner.stage(&SetParameters::Values(values(5)), (1, ms(101) + TICK_WITHIN), true).expect("it is legal");
+    tick(&mut tuner, 10, ms(110));
+    assert_eq!(kept_values(&*steps), values(5));
+}
+
+#[test]
 fn doubt_ends_by_itself() {
     let mut tuner = Tuner::new(steps(), ms(0));
     prepare(&mut tuner, &transaction(2), ms(1)).expect("it is legal");
@@ -206,6 +238,10 @@ fn transaction_that_cannot_be_agreed_on_is_refused_at_once() {
     assert_eq!(refusal(|one| one.participants.clear(), sent, ms(1)), ParameterError::Participants);
     assert_eq!(refusal(|one| one.participants[1].tid = 1, sent, ms(1)), ParameterError::Participants);
     assert_eq!(refusal(|_| {}, None, ms(1)), ParameterError::UnknownClock);
+    // An eighth of the lead of 100 ms is 12.5 ms.
+    assert_eq!(refusal(|_| {}, Some((ms(0), ms(13))), ms(1)), ParameterError::UnknownClock);
+    // It says that it was sent in the future.
+    assert_eq!(refusal(|_| {}, Some((ms(2_000), ms(0))), ms(1)), ParameterError::Lead);
     assert_eq!(refusal(|_| {}, sent, ms(50)), ParameterError::TooLate);
     let long = |one: &mut ParameterTransaction| one.lead_ns = LEAD_MAX.as_nanos() as u64 + 1;
     assert_eq!(refusal(long, sent, ms(1)), ParameterError::Lead);
@@ -236,6 +272,7 @@ fn kills_leave_all_or_none() {
         let world = World::run(seed, Plan::Kills);
         world.judge_survivors();
         world.judge_end();
+        world.judge_answer();
         refused += u32::from(world.verdict() == Some(TransactionVerdict::None));
         repaired += u32::from(world.verdict() == Some(TransactionVerdict::Repaired));
     }
