@@ -103,7 +103,8 @@ impl Sensor {
         }
     }
 
-    /// Asks the node until it is not held. Without an answer the sensor does not wait: in virtual time there is no node.
+    /// Asks the node until it is not held. Without an answer the sensor does not wait: in virtual time there is no
+    /// node.
     fn look_at_stop(&mut self, context: &mut AppContext<Self>) {
         let stop = Tid::new(context.tid().node, AppAddress::STOP);
         match context.message(stop, &AskStop {}).ask::<StopReport>(ASK_WITHIN) {
