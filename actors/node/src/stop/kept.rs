@@ -38,10 +38,11 @@ pub(super) struct Kept {
 }
 
 impl Kept {
-    /// Reads the file, and returns its presses and releases.
-    pub(super) fn begin(context: &NodeContext) -> (Self, Stops) {
+    /// Reads the file, and returns the presses and releases of a former life; `None` if there was none. From then on
+    /// there is a file, also before the first press.
+    pub(super) fn begin(context: &NodeContext) -> (Self, Option<Stops>) {
         let Some(directory) = &context.config.state else {
-            return (Self { changed: None, pending: None }, Stops::default());
+            return (Self { changed: None, pending: None }, None);
         };
         let path = state_files::path(directory, "stop", &context.config.project, context.node);
         let stops = read(&path).unwrap_or_else(|why| {
@@ -49,7 +50,7 @@ impl Kept {
                 ?path,
                 "the stop is pressed, as its file cannot be used: {why}; release it (`sinew stop release`), which replaces the file"
             );
-            unreadable(context)
+            Some(unreadable(context))
         });
         let (notify, changed) = sync_channel(1);
         let writer = path.clone();
@@ -62,7 +63,11 @@ impl Kept {
                 "a stop does not outlive this node, as there is no thread that writes it: {error}; {remedy}"
             );
         }
-        (Self { changed: started.is_ok().then_some(notify), pending: None }, stops)
+        let mut kept = Self { changed: started.is_ok().then_some(notify), pending: None };
+        if stops.is_none() {
+            kept.keep(&Stops::default());
+        }
+        (kept, stops)
     }
 
     /// Has these written. It never waits.
@@ -87,16 +92,14 @@ impl Kept {
     }
 }
 
-fn read(path: &Path) -> Result<Stops, String> {
-    let Some(bytes) = files::own(path, BYTES_MAX).map_err(|why| why.to_string())? else {
-        return Ok(Stops::default());
-    };
+fn read(path: &Path) -> Result<Option<Stops>, String> {
+    let Some(bytes) = files::own(path, BYTES_MAX).map_err(|why| why.to_string())? else { return Ok(None) };
     let content: Content = decode(&bytes).map_err(|error| error.to_string())?;
     // Other nodes refuse states with such entries: they would not learn of a press.
     if !content.entries.iter().all(Entry::is_legal) {
         return Err("it has an entry that no node writes".to_owned());
     }
-    Ok(content.entries.into_iter().collect())
+    Ok(Some(content.entries.into_iter().collect()))
 }
 
 /// Returns the press of a node that does not know whether it was stopped.
@@ -129,8 +132,10 @@ fn write(path: &Path, changed: &Receiver<Vec<Entry>>) {
 
 #[cfg(test)]
 mod tests {
+    use std::time::Duration;
+
     use sinew_model::config::NodeConfig;
-    use sinew_runtime::tid::Incarnation;
+    use sinew_runtime::{tid::Incarnation, time::Time};
     use sinew_security::testing::Directory;
 
     use super::*;
@@ -146,10 +151,16 @@ mod tests {
     fn file_that_cannot_be_read_is_a_press() {
         let directory = Directory::new();
         let context = context(&directory);
-        assert!(!Kept::begin(&context).1.is_open(), "there is no file");
         let path = state_files::path(directory.path(), "stop", &context.config.project, context.node);
+        assert_eq!(Kept::begin(&context).1, None, "there is no file");
+        let deadline = Time::now() + Duration::from_secs(60);
+        while !path.exists() {
+            assert!(Time::now() < deadline, "a life without a press leaves a file, too");
+            thread::yield_now();
+        }
+        assert_eq!(Kept::begin(&context).1, Some(Stops::default()));
         std::fs::write(path, [0xc1]).expect("the test's own directory");
-        assert!(Kept::begin(&context).1.is_open());
+        assert!(Kept::begin(&context).1.is_some_and(|stops| stops.is_open()));
     }
 
     // spec: STOP-7
@@ -163,6 +174,6 @@ mod tests {
         notify.send(stops.entries().cloned().collect()).expect("there is room");
         drop(notify);
         write(&path, &changed);
-        assert_eq!(Kept::begin(&context).1, stops);
+        assert_eq!(Kept::begin(&context).1, Some(stops));
     }
 }

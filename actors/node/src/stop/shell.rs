@@ -69,15 +69,16 @@ impl Shell {
     pub(super) fn new(state: &NodeState, now: Time) -> Self {
         let config = &state.ctx.config;
         let detection = config.ndl.period * (config.ndl.missed_max + 2);
+        let (kept, before) = Kept::begin(&state.ctx);
         let own = Own {
             node: state.ctx.node,
             incarnation: state.ctx.incarnation,
             name: config.name.clone(),
+            has_lived: before.is_some(),
             hold: config.ndl.period * 2 + look_period(config),
             on_lost: config.stop.on_lost.then_some(detection),
         };
-        let (kept, stops) = Kept::begin(&state.ctx);
-        let core = Core::new(own, stops, now);
+        let core = Core::new(own, before.unwrap_or_default(), now);
         Self {
             core,
             kept,

@@ -1,7 +1,8 @@
 //! The application `X.sensor`: reads the device each millisecond and sends the sample to its own drive and to
 //! central.
 //!
-//! It is ready when the first reading has arrived. A reading is sent once, never again with a newer stamp:
+//! It is ready when the first reading has arrived and its node is not held any more: no output of a node can be armed
+//! before that, and the parts of the robot get ready together. A reading is sent once, never again with a newer stamp:
 //! when the device falls silent so does the sensor, and its receivers watch for silence.
 
 use std::sync::Arc;
@@ -10,6 +11,7 @@ use exoskeleton_model::joint::Joint;
 use exoskeleton_model::message::{FootLoad, JointSample};
 use exoskeleton_model::sensor::{SensorConfig, SensorCore};
 use sinew::prelude::*;
+use sinew::stop::{AskStop, StopReport, StopState};
 use sinew::supervision::ReadyGate;
 
 use super::device::JointDevice;
@@ -25,6 +27,10 @@ pub type DeviceMaker = Arc<dyn Fn() -> Box<dyn JointDevice> + Send + Sync>;
 
 /// A tick that is later than this is recorded, to explain why samples were old.
 const LATE_MAX: Duration = Duration::from_millis(5);
+/// Interval between two looks at the stop of the node, while it is held at its start.
+const LOOK_AT_STOP: Duration = Duration::from_millis(10);
+/// Time limit of the answer.
+const ASK_WITHIN: Duration = Duration::from_secs(1);
 /// Name of that record.
 pub const SENSOR_LATE: &str = "sensor_late";
 
@@ -37,6 +43,8 @@ pub struct Sensor {
     drive: Addressee,
     gait: Addressee,
     ready: Option<ReadyGate>,
+    /// Whether the node may be held since its start.
+    is_held: bool,
     read_at: Option<Time>,
     silent: bool,
     events: Trace<EventRow>,
@@ -66,6 +74,7 @@ impl Sensor {
             drive: Addressee::new(drive_name(joint)),
             gait: Addressee::new(GAIT.to_owned()),
             ready: None,
+            is_held: true,
             read_at: None,
             silent: false,
             events,
@@ -87,8 +96,25 @@ impl Sensor {
         let sample = self.core.sample(t_ns, &reading.device);
         let load = reading.foot.map(|foot| self.core.foot_load(t_ns, &foot));
         self.send_sample(now, &sample, load.as_ref(), context);
-        if let Some(gate) = self.ready.take() {
+        if !self.is_held
+            && let Some(gate) = self.ready.take()
+        {
             gate.reached();
+        }
+    }
+
+    /// Asks the node until it is not held. Without an answer the sensor does not wait: in virtual time there is no
+    /// node.
+    fn look_at_stop(&mut self, context: &mut AppContext<Self>) {
+        let stop = Tid::new(context.tid().node, AppAddress::STOP);
+        match context.message(stop, &AskStop {}).ask::<StopReport>(ASK_WITHIN) {
+            Ok(answer) => drop(context.spawn(answer.into_actor(self).map(|answer, this, context| {
+                this.is_held = answer.is_ok_and(|report| report.state == StopState::Held);
+                if this.is_held {
+                    context.run_later(LOOK_AT_STOP, Self::look_at_stop);
+                }
+            }))),
+            Err(_) => self.is_held = false,
         }
     }
 
@@ -124,6 +150,7 @@ impl Actor for Sensor {
 
     fn started(&mut self, context: &mut Self::Context) {
         self.ready = context.hold_ready();
+        self.look_at_stop(context);
         let first = slots::next(context.now(), self.slot);
         context.every_from(first, PERIOD, |this, tick, context| this.tick(tick, context));
     }

@@ -43,6 +43,8 @@ pub(super) struct Own {
     pub(super) node: NodeAddress,
     pub(super) incarnation: Incarnation,
     pub(super) name: String,
+    /// Whether a former life of it may have had outputs that were live: it has kept its state.
+    pub(super) has_lived: bool,
     /// How long it is held at its start.
     pub(super) hold: Duration,
     /// Time within which it presses after it has lost a node; `None`: it does not.
@@ -125,7 +127,7 @@ pub(super) struct Core {
     /// When its state changed last.
     changed_at: Time,
     latched: StopState,
-    /// Whether outputs could ever be armed in this life.
+    /// Whether outputs could ever be armed in this life, or in a former one.
     has_run: bool,
     /// Whether the newest presses and releases are ordered to be written.
     is_kept: bool,
@@ -135,6 +137,7 @@ pub(super) struct Core {
 impl Core {
     /// Begins the life of a node, with the presses and releases of former ones.
     pub(super) fn new(own: Own, stops: Stops, now: Time) -> Self {
+        let has_run = own.has_lived;
         let mut core = Self {
             own,
             stopped_at: stops.is_open().then_some(now),
@@ -148,7 +151,7 @@ impl Core {
             changed_at: now,
             // As the latch of a new node.
             latched: StopState::Released,
-            has_run: false,
+            has_run,
             is_kept: true,
             orders: VecDeque::new(),
         };
@@ -241,7 +244,7 @@ impl Core {
             self.begin_stop(now);
         } else if merged.has_press || merged.has_release {
             if merged.has_press && self.has_run && self.latched != StopState::Stopped {
-                // This node was away during a whole stop.
+                // This node was away during a whole stop, or ended in it. spec: STOP-7
                 self.orders.push_back(Output::PassStop);
             }
             self.note_change(now);

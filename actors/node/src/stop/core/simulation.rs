@@ -29,7 +29,8 @@ struct Node {
 
 impl Node {
     fn new(index: usize, incarnation: u64, kept: Stops, now: Time) -> Self {
-        let own = Own { incarnation: Incarnation(incarnation), ..own(NODES[index]) };
+        let own =
+            Own { incarnation: Incarnation(incarnation), has_lived: incarnation > 1, ..own(NODES[index]) };
         let core = Core::new(own, kept.clone(), now);
         Self { core, incarnation, latch: StopState::Released, moving: 0, kept }
     }

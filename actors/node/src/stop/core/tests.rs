@@ -15,7 +15,14 @@ pub(super) fn person(node: u32) -> Tid {
 
 pub(super) fn own(node: u32) -> Own {
     let name = format!("node {node}");
-    Own { node: address(node), incarnation: Incarnation(1), name, hold: HOLD, on_lost: None }
+    Own {
+        node: address(node),
+        incarnation: Incarnation(1),
+        name,
+        has_lived: false,
+        hold: HOLD,
+        on_lost: None,
+    }
 }
 
 fn at(millis: u64) -> Time {
@@ -124,6 +131,11 @@ fn missed_stop_makes_outputs_safe_on_return() {
     let mut fresh = Core::new(own(3), Stops::default(), at(3_500));
     exchange(at(4_000), &core, &mut fresh);
     assert!(!orders(&mut fresh).contains(&Output::PassStop));
+    // One that was killed in it, before the press was on its disk, had one.
+    let killed = Own { has_lived: true, ..own(4) };
+    let mut killed = Core::new(killed, Stops::default(), at(3_500));
+    exchange(at(4_000), &core, &mut killed);
+    assert!(orders(&mut killed).contains(&Output::PassStop));
 }
 
 // spec: STOP-7
