@@ -56,7 +56,7 @@ impl Fleet {
 
     /// Returns the folder of the robot on a host.
     pub(super) fn folder(&self, host: &str) -> &Path {
-        self.sessions.get(host).map_or(Path::new("/"), |session| &session.folder)
+        self.sessions.get(host).map_or_else(|| Path::new("/"), |session| session.folder.as_path())
     }
 
     /// Returns the nodes with files on these hosts, beside each other; `None` for all hosts.
@@ -89,10 +89,8 @@ impl Fleet {
         let mut hashes: Vec<Hash> = orders.flat_map(NodeOrder::hashes).cloned().collect();
         hashes.sort();
         hashes.dedup();
-        let missing = match session.ask(&Request::Missing(hashes))? {
-            Answer::Missing(missing) => missing,
-            other => return Err(session.unfit(&other)),
-        };
+        let answer = session.ask(&Request::Missing(hashes))?;
+        let Answer::Missing(missing) = answer else { return Err(session.unfit(&answer)) };
         let mut sent = Sent::default();
         for hash in missing {
             let Some(path) = contents.get(&hash) else { continue };

@@ -107,7 +107,7 @@ impl Robot {
             ConfigError::one(fault(&path.display().to_string(), found, legal, remedy))
         })?;
         let absolute = std::path::absolute(path).unwrap_or_else(|_| path.to_owned());
-        let folder = absolute.parent().unwrap_or(Path::new("/"));
+        let folder = absolute.parent().unwrap_or_else(|| Path::new("/"));
         Self::from_toml(&text, folder).map_err(|faults| faults.of_file(path))
     }
 

@@ -125,13 +125,12 @@ impl Session {
                 Err(HostError::Unreachable { why, .. }) => why,
                 Err(refused @ HostError::Refused { .. }) => return Err(refused),
             };
-            match session.streams.wait(ENDED_WITHIN) {
-                Some(LACKS_PROGRAM) if !is_copied => {
-                    copy(host, destination, &remote, (&program, bytes)).map_err(unreachable)?;
-                    is_copied = true;
-                }
-                code => return Err(unreachable(explained(code, &why, destination))),
+            let code = session.streams.wait(ENDED_WITHIN);
+            if code != Some(LACKS_PROGRAM) || is_copied {
+                return Err(unreachable(explained(code, &why, destination)));
             }
+            copy(host, destination, &remote, (&program, bytes)).map_err(unreachable)?;
+            is_copied = true;
         }
     }
 
@@ -173,18 +172,16 @@ impl Session {
 
     /// Returns the nodes with files on the host.
     pub(super) fn observe(&mut self, asks: bool) -> Result<Vec<NodeSeen>, HostError> {
-        match self.ask(&Request::Observe { asks })? {
-            Answer::Nodes(nodes) => Ok(nodes),
-            other => Err(self.unfit(&other)),
-        }
+        let answer = self.ask(&Request::Observe { asks })?;
+        let Answer::Nodes(nodes) = answer else { return Err(self.unfit(&answer)) };
+        Ok(nodes)
     }
 
     /// Asks for something to be done, and returns the host's note.
     pub(super) fn order(&mut self, request: &Request) -> Result<String, HostError> {
-        match self.ask(request)? {
-            Answer::Done(note) | Answer::Log(note) => Ok(note),
-            other => Err(self.unfit(&other)),
-        }
+        let answer = self.ask(request)?;
+        let (Answer::Done(note) | Answer::Log(note)) = answer else { return Err(self.unfit(&answer)) };
+        Ok(note)
     }
 
     fn ask_within(&mut self, request: &Request, within: Duration) -> Result<Answer, HostError> {
@@ -286,13 +283,12 @@ fn copy(
     let _ = streams.write(Written::File(file, bytes));
     streams.close_input();
     let within = ENTERED_WITHIN + Duration::from_secs(bytes / BYTES_PER_SECOND);
-    match streams.wait(within) {
-        Some(0) => Ok(()),
-        code => {
-            let why = format!("the program sinew was not copied there; {}", clean_lines(&streams.words()));
-            Err(explained(code, &why, destination))
-        }
+    let code = streams.wait(within);
+    if code == Some(0) {
+        return Ok(());
     }
+    let why = format!("the program sinew was not copied there; {}", clean_lines(&streams.words()));
+    Err(explained(code, &why, destination))
 }
 
 /// Adds the remedy for an exit code.
