@@ -78,6 +78,14 @@ impl Fleet {
         self.session(host)?.order(request)
     }
 
+    /// Removes the leftovers of a start that changed nothing from all hosts: its lock, and files that it sent.
+    pub(super) fn sweep(&mut self) {
+        for session in self.sessions.values_mut() {
+            // The cause of the failed start is reported, and the next one sweeps again.
+            let _ = session.order(&Request::Sweep);
+        }
+    }
+
     /// Sends the contents that a host lacks for these orders.
     pub(super) fn send<'o>(
         &mut self,

@@ -57,8 +57,12 @@ pub(super) fn up(robot: &Robot, is_dry: bool, printer: Printer) -> Result<Report
         return Ok(Report { text, json: json!({ "plan": rows_json(&plan) }), is_fine: true });
     }
     printer.line(&text);
-    check(&mut fleet, &plan, &gathered)?;
-    send(&mut fleet, &plan, &gathered, printer)?;
+    let prepared =
+        check(&mut fleet, &plan, &gathered).and_then(|()| send(&mut fleet, &plan, &gathered, printer));
+    if prepared.is_err() {
+        fleet.sweep();
+    }
+    prepared?;
     for step in &plan.steps {
         take(step, robot, &mut fleet, &gathered, printer)?;
     }
@@ -88,7 +92,13 @@ pub(super) fn enter(
             }
         }
     }
-    if faults.is_empty() { Ok((fleet, seen)) } else { Err(unchanged(&faults)) }
+    if faults.is_empty() {
+        return Ok((fleet, seen));
+    }
+    if access == Access::Change {
+        fleet.sweep();
+    }
+    Err(unchanged(&faults))
 }
 
 /// Checks that the ports and sockets of all nodes that are started are free.

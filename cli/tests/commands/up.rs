@@ -226,6 +226,7 @@ fn taken_port_is_named_before_any_change() {
     assert_eq!(up.code, Some(1), "{}", up.out);
     let words = format!("knee: TCP port 127.0.0.2:{port} is taken by process {} (", std::process::id());
     assert!(up.err.contains("nothing was changed:") && up.err.contains(&words), "{}", up.err);
+    assert!(!robot.path("state").exists(), "a start that changes nothing leaves a folder");
 }
 
 #[test]
