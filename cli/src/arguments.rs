@@ -4,11 +4,11 @@ use std::{path::PathBuf, time::Duration};
 
 use clap::{CommandFactory as _, FromArgMatches as _, Parser, Subcommand};
 
-use crate::{bag, keys, logs, param, play, record, send, stop, view, watch, why};
+use crate::{bag, keys, logs, param, play, record, send, stop, up, view, watch, why};
 
 /// Shows a running Sinew system, from any one node of it. It changes nothing, except that `send` and `play` send
-/// messages, `param` and the page of `view` set parameters, `stop` stops the system, and `keys`, `record` and `bag`
-/// write files.
+/// messages, `param` and the page of `view` set parameters, `stop` stops the system, `up` and `down` start and end its
+/// nodes, and `keys`, `record` and `bag` write files.
 ///
 /// It connects to the socket of a node on this machine (`lncl.socket` in the node's configuration) and asks
 /// that node, and through it all others.
@@ -104,7 +104,8 @@ pub(crate) enum Command {
   sinew logs
   sinew logs -f --since 10s
   sinew logs --node knee --level warn
-  sinew logs -f --json | jq -r 'select(.level == "error") | .text'"#)]
+  sinew logs -f --json | jq -r 'select(.level == "error") | .text'
+  sinew logs --robot my-leg.toml              the output of the nodes' processes, also of ended ones"#)]
     Logs(logs::Order),
     /// Shows nodes, applications, links and losses on the terminal, twice a second: rates, queues, lateness, guards
     ///
@@ -227,6 +228,40 @@ pub(crate) enum Command {
   sinew stop release"#
     )]
     Stop(stop::Order),
+    /// Starts the nodes of a robot file on all its hosts, and waits until the robot is released
+    ///
+    /// The plan names for each node whether it is kept, started or started again, and why. Files are copied by the
+    /// hashes of their contents, and the keys of a node only to its host: to this host directly, to others by the
+    /// system's `ssh`. Nothing is stopped before all files are there. A node starts once those in its `after` are
+    /// ready. Each wait has a deadline, and names the applications that block and their reasons. Run again, it changes
+    /// only the nodes whose program, files, keys or settings changed.
+    ///
+    /// Exit code 0: all nodes are ready. 1: they are not, a host cannot be reached, or a file is missing.
+    #[command(after_help = r#"Examples:
+  sinew up                                    the nodes of robot.toml
+  sinew up --dry-run my-leg.toml
+  sinew up --systemd my-leg.toml"#)]
+    Up(up::UpOrder),
+    /// Ends the nodes of a robot file on all its hosts, and removes their files, keys and logs
+    ///
+    /// Nodes end in the reverse order of their start: by SIGTERM, and by SIGKILL after `stop_within_ms`. Only processes
+    /// that `sinew up` has started are ended. Files that a node has written itself stay, and are named.
+    ///
+    /// Exit code 0: nothing is left. 1: a host cannot be reached, or a node does not end.
+    #[command(after_help = r#"Examples:
+  sinew down
+  sinew down my-leg.toml"#)]
+    Down(up::FileOrder),
+    /// Shows the nodes of a robot file on all its hosts: process, up time, and whether each is ready or why not
+    ///
+    /// Exit code 0: all are ready.
+    #[command(after_help = r#"Examples:
+  sinew status
+  sinew status my-leg.toml --json | jq '.nodes[] | select(.state != "ready")'"#)]
+    Status(up::FileOrder),
+    /// The part of `sinew up` on a host
+    #[command(hide = true)]
+    Host(up::HostOrder),
     /// Reloads the access list and the deny list of the local node, without a restart
     ///
     /// A list with faults changes nothing: each is named with its line, and the list in force stays.
@@ -294,7 +329,7 @@ fn seconds(text: &str) -> Result<Duration, String> {
 }
 
 /// Commands that send no request to a node: the options that select a node and its time limit do not apply to them.
-const ASK_NO_NODE: [&str; 3] = ["keys", "bag", "completions"];
+const ASK_NO_NODE: [&str; 7] = ["up", "down", "status", "host", "keys", "bag", "completions"];
 
 /// The command, as its help shows it.
 pub(crate) fn command() -> clap::Command {
@@ -328,7 +363,7 @@ Exit codes:
   0  no problem was found
   1  a problem was found: a node or an application does not answer, is not ready or refuses, a message was not delivered, a name is
      unknown, a list cannot be used, keys cannot be made or are valid for less than 30 days, a recording is incomplete or cannot be read,
-     a program sends other messages than those of a recording
+     a program sends other messages than those of a recording, a robot is not released
   2  the command line is wrong
   3  no node on this machine accepts this command, or that node does not answer
   4  all is fine, but standard output did not take all of it (a full disk); a reader that closes its pipe, as `head`, is no error
@@ -345,6 +380,7 @@ Examples:
   sinew why hip knee.drive
   sinew param set knee.drive.assistance=0.5
   sinew view
+  sinew up my-leg.toml
   sinew reload
   sinew apps --json | jq '.apps[] | select(.ready | not)'
   sinew --socket /run/sinew/knee.sock barriers

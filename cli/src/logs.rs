@@ -7,7 +7,11 @@ mod merge;
 mod screen;
 mod source;
 
-use std::{collections::BTreeMap, time::Duration};
+use std::{
+    collections::BTreeMap,
+    path::{Path, PathBuf},
+    time::Duration,
+};
 
 use clap::{Args, ValueEnum};
 use serde_json::Value;
@@ -55,6 +59,22 @@ pub(crate) struct Order {
     /// Only lines of the last so long, as in 10s or 5m. Without it: all that the nodes keep
     #[arg(long, value_name = "TIME", value_parser = sizes::time)]
     since: Option<Duration>,
+    /// The end of the standard output and standard error of the processes that `sinew up` has started by this robot
+    /// file, from all its hosts. Without a node's name 64 KiB of each, else 1 MiB
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["follow", "level", "since"])]
+    robot: Option<PathBuf>,
+}
+
+impl Order {
+    /// Returns the robot file, if the logs of its processes are asked for.
+    pub(crate) fn robot(&self) -> Option<&Path> {
+        self.robot.as_deref()
+    }
+
+    /// Returns the node that is asked for.
+    pub(crate) fn node(&self) -> Option<&str> {
+        self.node.as_deref()
+    }
 }
 
 /// The least severe level that is shown.

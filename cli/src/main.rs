@@ -5,7 +5,8 @@
 //! its access list again, `param` sets parameters of applications, and `stop` presses and releases the stop. `record`
 //! has the node record its messages, and writes them to a file. `play` sends them again, by a node of its own unless
 //! told otherwise. `keys` asks no node: it creates the files by which nodes authenticate each other. `bag` reads the
-//! files of recordings. `view` keeps asking all nodes, for programs that read their metrics, `top` for its
+//! files of recordings. `up` and `down` start and end the nodes of a robot file, on this host and on others, and
+//! `status` shows them. `view` keeps asking all nodes, for programs that read their metrics, `top` for its
 //! screen, and `logs -f` for new lines.
 
 #![warn(clippy::print_stdout, clippy::print_stderr)] // `output` prints: the macros panic where a pipe is closed or a disk is full.
@@ -36,6 +37,7 @@ mod table;
 mod top;
 mod tree;
 mod unknown;
+mod up;
 mod view;
 mod watch;
 mod why;
@@ -73,6 +75,9 @@ fn main() -> ExitCode {
         Ok(arguments) => arguments,
         Err(error) => return refused(&error),
     };
+    if let Command::Host(order) = &arguments.command {
+        return up::host(order);
+    }
     match run(&arguments) {
         Ok(report) => {
             let json = || if report.json.is_null() { String::new() } else { format!("{:#}\n", report.json) };
@@ -134,7 +139,10 @@ fn run(arguments: &Arguments) -> Result<Report, SystemError> {
         Command::Watch(order) => {
             inside(&|system| watch::show(system, order, (arguments.json, arguments.wide)))
         }
-        Command::Logs(order) => inside(&|system| logs::show(system, order, arguments.json)),
+        Command::Logs(order) => match order.robot() {
+            Some(file) => up::logs(file, order.node()),
+            None => inside(&|system| logs::show(system, order, arguments.json)),
+        },
         Command::Top => top::show(arguments),
         Command::Play(order) => play::show(order, arguments),
         Command::Record(order) => inside(&|system| record::show(system, order)),
@@ -147,6 +155,11 @@ fn run(arguments: &Arguments) -> Result<Report, SystemError> {
         Command::Param(order) => inside(&|system| param::show(system, order, arguments.wide)),
         Command::Reload => inside(&reload::show),
         Command::Stop(order) => inside(&|system| stop::show(system, order, arguments.wide)),
+        Command::Up(order) => up::up(order, (arguments.json, arguments.wide)),
+        Command::Down(order) => up::down(order, (arguments.json, arguments.wide)),
+        Command::Status(order) => up::status(order, arguments.wide),
+        // Handled before: it prints no report.
+        Command::Host(_) => Err(SystemError::Usage("`host` is the part of `sinew up` on a host".to_owned())),
         Command::Doctor { rt: Some(length), .. } => Ok(doctor::show_real_time(*length, arguments.wide)),
         Command::Doctor { interface, rt: None } => Ok(doctor::show(interface.clone(), arguments)),
         Command::Keys(order) => keys::show(order, arguments.wide),

@@ -58,6 +58,9 @@ pub(crate) enum SystemError {
     /// The metrics cannot be served, or the terminal cannot be used.
     #[error("{0}")]
     View(String),
+    /// A robot cannot be started, changed or stopped.
+    #[error("{0}")]
+    Up(String),
     /// The command line is invalid.
     #[error("{0}")]
     Usage(String),
@@ -75,9 +78,12 @@ impl SystemError {
     /// Returns the exit code: see [`Arguments`](crate::arguments::Arguments).
     pub(crate) const fn code(&self) -> u8 {
         match self {
-            Self::ItsNode(..) | Self::Unknown(_) | Self::Keys(_) | Self::Bag(_) | Self::View(_) => {
-                EXIT_FINDING
-            }
+            Self::ItsNode(..)
+            | Self::Unknown(_)
+            | Self::Keys(_)
+            | Self::Bag(_)
+            | Self::View(_)
+            | Self::Up(_) => EXIT_FINDING,
             Self::Usage(_) => EXIT_USAGE,
             Self::NoSocket(_) | Self::NotRegistered(..) | Self::NoAnswer(..) => EXIT_NO_NODE,
         }

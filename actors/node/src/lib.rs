@@ -43,6 +43,7 @@ mod standstill_tests;
 mod state;
 mod stop;
 mod supervisor_spec;
+mod systemd;
 mod thread_placement;
 mod traffic;
 mod tree;

@@ -126,6 +126,9 @@ impl Node {
 
     /// Runs until SIGINT, SIGTERM or SIGHUP ([`signals`](crate::signals)), or until the node gives up; then
     /// stops in order. Returns the exit code for `main`: 0 after an orderly stop, 1 after giving up.
+    ///
+    /// If systemd has started the process, it is notified that the node is ready, makes progress, or stops
+    /// (`Type=notify`, `WatchdogSec=`).
     pub fn run(mut self) -> ExitCode {
         if self.handle.hosts_other_node {
             if play_check::is_asked() {

@@ -3,6 +3,8 @@
 mod events;
 mod progress;
 mod registration;
+mod signals;
+mod systemd;
 
 use std::{
     cell::RefCell,
@@ -12,7 +14,7 @@ use std::{
     time::Duration,
 };
 
-use actix::{Actor, ActorContext, AsyncContext, Context, StreamHandler, fut::WrapFuture};
+use actix::{Actor, ActorContext, AsyncContext, Context, StreamHandler};
 use sinew_model::{events::LayerReport, leave_reason::LeaveReason};
 use sinew_runtime::{
     event_queue::EventQueue,
@@ -38,7 +40,7 @@ use super::{
     shutdown::{self, Branch, SupervisorHandles},
     supervisor_spec::SupervisorSpec,
 };
-use crate::{NodeState, process, signals::StopSignals};
+use crate::{NodeState, process, systemd::Notifier};
 
 /// Maximum number of confirmed messages and requests in flight per application.
 pub(crate) const WAITS_MAX: usize = 1_024;
@@ -97,6 +99,8 @@ pub(super) struct Root {
     heeds_signals: bool,
     /// Only the node itself handles its end.
     runs_alone: bool,
+    /// Set if systemd expects notifications.
+    notifier: Option<Notifier>,
 }
 
 /// Runs the root thread.
@@ -148,6 +152,7 @@ pub(super) fn run(
         running_waiters: Vec::new(),
         heeds_signals: false,
         runs_alone: false,
+        notifier: None,
         state,
     };
     // Until the root's own end: a program that stops the current actor system does not end the node.
@@ -208,6 +213,7 @@ impl StreamHandler<RootEvent> for Root {
             }
             RootEvent::RunsAlone => {
                 self.runs_alone = true;
+                self.begin_notifications(context);
                 self.notify_if_running();
                 self.end_on_cycle(context);
             }
@@ -443,6 +449,7 @@ impl Root {
         }
         sinew_runtime::log::info!(node = self.state.ctx.config.name, "the node stops");
         self.phase = Phase::StoppingApps;
+        self.notify_stop();
         self.state.recording.stop_ordered();
         self.notify_if_running();
         match &self.app_supervisor {
@@ -470,26 +477,6 @@ impl Root {
         // The owner may have been dropped.
         let _ = self.ended.try_send(self.end.clone());
         context.stop();
-    }
-
-    fn heed_signals(&mut self, context: &mut Context<Self>) {
-        if std::mem::replace(&mut self.heeds_signals, true) {
-            return;
-        }
-        let queue = self.state.root.clone();
-        let mut signals = match StopSignals::listen() {
-            Ok(signals) => signals,
-            Err(error) => {
-                sinew_runtime::log::error!(%error, remedy = "stop this node by its handle", "SIGINT, SIGTERM and SIGHUP cannot be handled and end this process at once");
-                return;
-            }
-        };
-        let heed = async move {
-            let which = signals.recv().await;
-            sinew_runtime::log::info!(signal = which, "a signal asks for a stop");
-            post_event(&queue, RootEvent::StopOrdered);
-        };
-        context.spawn(heed.into_actor(self));
     }
 }
 

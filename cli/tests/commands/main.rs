@@ -20,6 +20,8 @@ mod secured;
 mod send;
 mod stop;
 mod top;
+mod up;
+mod up_hosts;
 mod view;
 mod watch;
 mod why;

@@ -35,6 +35,21 @@ fn example_file_matches_its_comments() {
 }
 
 #[test]
+fn topology_for_one_host_has_distinct_nodes() {
+    let topology = Topology::parse(include_str!("../../here.toml")).unwrap();
+    let nodes = Part::ALL.map(|part| topology.node_config(part));
+    let addresses: BTreeSet<_> = nodes.iter().map(|config| config.node_address().to_string()).collect();
+    let sockets: BTreeSet<_> = nodes.iter().map(|config| config.lncl.socket.clone()).collect();
+    assert_eq!((addresses.len(), sockets.len()), (4, 4));
+    // `sinew up` asks the nodes at the sockets that its own file names.
+    let robot = include_str!("../../robot.toml");
+    for config in nodes {
+        let socket = config.lncl.socket.expect("each has one").display().to_string();
+        assert!(robot.contains(&format!("socket = \"{socket}\"")), "{socket}");
+    }
+}
+
+#[test]
 fn topology_file_of_a_local_run_reads_back() {
     let topology = for_this_host(7).unwrap();
     assert_eq!(Topology::parse(&topology.to_toml()), Ok(topology));
