@@ -95,10 +95,19 @@ impl<'py, 'data> Reader<'py, 'data> {
             Marker::I64 => i64::from_be_bytes(self.array()?).into_pyobject(py)?.into_any(),
             Marker::F32 => PyFloat::new(py, f32::from_be_bytes(self.array()?).into()).into_any(),
             Marker::F64 => PyFloat::new(py, f64::from_be_bytes(self.array()?)).into_any(),
-            Marker::FixStr(_) | Marker::Str8 | Marker::Str16 | Marker::Str32 => self.text(marker)?,
-            Marker::Bin8 | Marker::Bin16 | Marker::Bin32 => self.bytes(marker)?,
-            Marker::FixArray(_) | Marker::Array16 | Marker::Array32 => self.list(marker, depth)?,
-            Marker::FixMap(_) | Marker::Map16 | Marker::Map32 => self.map(marker, depth)?,
+            Marker::FixStr(length) => self.text(length.into())?,
+            Marker::Str8 => self.length::<1>().and_then(|length| self.text(length))?,
+            Marker::Str16 => self.length::<2>().and_then(|length| self.text(length))?,
+            Marker::Str32 => self.length::<4>().and_then(|length| self.text(length))?,
+            Marker::Bin8 => self.length::<1>().and_then(|length| self.bytes(length))?,
+            Marker::Bin16 => self.length::<2>().and_then(|length| self.bytes(length))?,
+            Marker::Bin32 => self.length::<4>().and_then(|length| self.bytes(length))?,
+            Marker::FixArray(length) => self.list(length.into(), depth)?,
+            Marker::Array16 => self.length::<2>().and_then(|length| self.list(length, depth))?,
+            Marker::Array32 => self.length::<4>().and_then(|length| self.list(length, depth))?,
+            Marker::FixMap(length) => self.map(length.into(), depth)?,
+            Marker::Map16 => self.length::<2>().and_then(|length| self.map(length, depth))?,
+            Marker::Map32 => self.length::<4>().and_then(|length| self.map(length, depth))?,
             Marker::FixExt1
             | Marker::FixExt2
             | Marker::FixExt4
@@ -111,38 +120,27 @@ impl<'py, 'data> Reader<'py, 'data> {
         })
     }
 
-    fn length_of(&mut self, marker: Marker) -> PyResult<usize> {
-        match marker {
-            Marker::FixStr(length) | Marker::FixArray(length) | Marker::FixMap(length) => Ok(length.into()),
-            Marker::Str8 | Marker::Bin8 => self.length::<1>(),
-            Marker::Str16 | Marker::Bin16 | Marker::Array16 | Marker::Map16 => self.length::<2>(),
-            _ => self.length::<4>(),
-        }
-    }
-
-    fn text(&mut self, marker: Marker) -> PyResult<Bound<'py, PyAny>> {
-        let length = self.length_of(marker)?;
+    fn text(&mut self, length: usize) -> PyResult<Bound<'py, PyAny>> {
         let bytes = self.take(length)?;
         let text = std::str::from_utf8(bytes).map_err(|_| self.malformed("a text is no UTF-8"))?;
         Ok(PyString::new(self.py, text).into_any())
     }
 
-    fn bytes(&mut self, marker: Marker) -> PyResult<Bound<'py, PyAny>> {
-        let length = self.length_of(marker)?;
+    fn bytes(&mut self, length: usize) -> PyResult<Bound<'py, PyAny>> {
         Ok(PyBytes::new(self.py, self.take(length)?).into_any())
     }
 
-    fn list(&mut self, marker: Marker, depth: usize) -> PyResult<Bound<'py, PyAny>> {
+    fn list(&mut self, length: usize, depth: usize) -> PyResult<Bound<'py, PyAny>> {
         let list = PyList::empty(self.py);
-        for _ in 0..self.length_of(marker)? {
+        for _ in 0..length {
             list.append(self.value(depth + 1)?)?;
         }
         Ok(list.into_any())
     }
 
-    fn map(&mut self, marker: Marker, depth: usize) -> PyResult<Bound<'py, PyAny>> {
+    fn map(&mut self, length: usize, depth: usize) -> PyResult<Bound<'py, PyAny>> {
         let map = PyDict::new(self.py);
-        for _ in 0..self.length_of(marker)? {
+        for _ in 0..length {
             let (key, value) = (self.value(depth + 1)?, self.value(depth + 1)?);
             map.set_item(key, value).map_err(|_| self.malformed("a key is a list or a map"))?;
         }

@@ -2,20 +2,16 @@
 
 use std::{
     ops::{Deref, DerefMut},
-    path::PathBuf,
     sync::{Arc, Mutex, PoisonError},
     time::Duration,
 };
 
 use pyo3::{exceptions::PyValueError, prelude::*, pybacked::PyBackedBytes};
-use sinew_client::{
-    ApiError, AsyncEndpoint, Barrier, EventLoop, LoanedMessage, MessageBuilder, NodeApi, Registration,
-    Transport,
-};
-use sinew_model::{barrier::OnPartyLoss, facts::NodeEvent};
+use sinew_client::{ApiError, AsyncEndpoint, Barrier, EventLoop, LoanedMessage, MessageBuilder, Transport};
+use sinew_model::barrier::OnPartyLoss;
 use sinew_runtime::{
-    app::RequirementEvent,
-    tid::{AppAddress, Tid},
+    outcome::Outcome,
+    tid::Tid,
     wire::{Class, Kind},
 };
 
@@ -29,83 +25,8 @@ use crate::{
 
 /// Time limit for the node's answer to a name, if the message has no shorter one.
 const NAMED_WITHIN: Duration = Duration::from_secs(1);
-/// Time limit to reach the socket of a node that is trusted only as this user's own, or root's.
-const CONNECT_WITHIN: Duration = Duration::from_secs(2);
-/// Maximum of `inbox_capacity`.
-const INBOX_MAX: usize = 65_536;
-
-/// The options of a registration.
-#[derive(FromPyObject)]
-#[pyo3(from_item_all)]
-pub(crate) struct Options {
-    name: Option<String>,
-    requires: Vec<String>,
-    handles: Vec<String>,
-    node_events: bool,
-    requirement_events: bool,
-    deadline: f64,
-    stall_timeout: f64,
-    inbox_capacity: usize,
-    address: Option<u32>,
-    socket_only: bool,
-    reconnect: bool,
-    own_user_only: bool,
-}
-
-impl Options {
-    fn registration(self) -> PyResult<Registration> {
-        if !(1..=INBOX_MAX).contains(&self.inbox_capacity) {
-            let text = format!("inbox_capacity is {}: take 1 to {INBOX_MAX} messages", self.inbox_capacity);
-            return Err(PyValueError::new_err(text));
-        }
-        let mut registration = Registration::new()
-            .requires(self.requires)
-            .deadline(seconds("deadline", self.deadline)?)
-            .stall_timeout(seconds("stall_timeout", self.stall_timeout)?)
-            .inbox_capacity(self.inbox_capacity);
-        if let Some(name) = self.name {
-            registration = registration.name(name);
-        }
-        if let Some(address) = self.address {
-            registration = registration.fixed_address(AppAddress::new(address));
-        }
-        for kind in self.handles {
-            registration = registration.handles_named(kind);
-        }
-        if self.node_events {
-            registration = registration.subscribe::<NodeEvent>();
-        }
-        if self.requirement_events {
-            registration = registration.subscribe::<RequirementEvent>();
-        }
-        if self.socket_only {
-            registration = registration.transport(Transport::Socket);
-        }
-        Ok(if self.reconnect { registration } else { registration.without_reconnect() })
-    }
-}
-
-/// Begins a registration at the node with this socket. The result is a `Core`.
-#[pyfunction]
-pub(crate) fn register(py: Python<'_>, socket: PathBuf, options: Options) -> PyResult<Operation> {
-    let own_user_only = options.own_user_only;
-    let registration = options.registration()?;
-    let events = EventLoop::new()?;
-    let connected = py.detach(|| {
-        if own_user_only {
-            NodeApi::connect_trusted(socket, CONNECT_WITHIN)
-        } else {
-            NodeApi::connect(socket)
-        }
-    });
-    let node = connected.map_err(|error| errors::api(py, &error))?;
-    let of_endpoint = events.clone();
-    let future = async move {
-        let endpoint = node.register_transport_address_on(registration, of_endpoint).await?;
-        Ok(Done::Registered(Box::new(endpoint)))
-    };
-    Ok(Operation::new(Box::pin(future), events))
-}
+/// A report of undelivered messages: destination, its name, kind, the code of the reason, count.
+type UndeliveredTuple = (u64, Option<String>, Option<u32>, u8, u64);
 
 /// A destination: the bits of a TID, or a name.
 #[derive(FromPyObject)]
@@ -193,7 +114,7 @@ impl Draft {
     }
 }
 
-/// What an endpoint knows about itself, as of the end of its last operation.
+/// The properties of an endpoint, as of the end of its last operation.
 struct Facts {
     tid: u64,
     registrations: u64,
@@ -361,7 +282,7 @@ impl Core {
         self.begin(py, move |endpoint| {
             Box::pin(async move {
                 let reply = draft.builder(endpoint).await?.ask_raw(within).await?;
-                Ok(Done::Received(reply))
+                Ok(Done::Received(Arc::new(reply)))
             })
         })
     }
@@ -385,7 +306,9 @@ impl Core {
 
     /// Waits for a message: a `Received`.
     fn receive(&self, py: Python<'_>) -> PyResult<Operation> {
-        self.begin(py, |endpoint| Box::pin(async move { Ok(Done::Received(endpoint.receive().await?)) }))
+        self.begin(py, |endpoint| {
+            Box::pin(async move { Ok(Done::Received(Arc::new(endpoint.receive().await?))) })
+        })
     }
 
     /// Looks a name up: the bits of a TID, or `None`.
@@ -409,8 +332,8 @@ impl Core {
         })
     }
 
-    /// Waits at a barrier: the number of its opening. `options`: whether it fails when a party is lost, and whether it is
-    /// a phase.
+    /// Waits at a barrier: the number of its opening. `options`: whether it fails when a party is lost, and whether it
+    /// is a phase.
     fn meet(
         &self,
         py: Python<'_>,
@@ -469,16 +392,12 @@ impl Core {
         }
     }
 
-    /// Returns the next report of messages that were not delivered: destination, its name, kind, the code of the reason,
-    /// count. Never waits.
-    fn take_undelivered(
-        &self,
-        py: Python<'_>,
-    ) -> PyResult<Option<(u64, Option<String>, Option<u32>, u8, u64)>> {
+    /// Returns the next report of messages that were not delivered. Never waits.
+    fn take_undelivered(&self, py: Python<'_>) -> PyResult<Option<UndeliveredTuple>> {
         let mut lease = self.lease(py)?;
         let report = lease.as_mut().and_then(AsyncEndpoint::take_undelivered);
         Ok(report.map(|report| {
-            let code = sinew_runtime::outcome::Outcome::Rejected(report.why).code();
+            let code = Outcome::Rejected(report.why).code();
             (report.destination.bits(), report.name, report.kind.map(Kind::bits), code, report.count)
         }))
     }

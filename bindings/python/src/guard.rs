@@ -114,8 +114,8 @@ pub(crate) fn safe_function(
     }
 }
 
-/// The guard of an output. Each call releases the GIL before it waits for the output: the thread that makes outputs safe
-/// holds the output while it waits for the GIL.
+/// The guard of an output. Each call releases the GIL before it waits for the output: the thread that makes outputs
+/// safe holds the output while it waits for the GIL.
 #[pyclass(frozen, module = "sinew._sinew")]
 pub(crate) struct OutputGuard(Option<Guard<()>>);
 
@@ -153,7 +153,7 @@ impl Drop for OutputGuard {
         }
         // Without the GIL. If there is no interpreter any more, nothing waits for it.
         let mut guard = Some(guard);
-        Python::try_attach(|py| py.detach(|| guard.take()));
+        let _ = Python::try_attach(|py| py.detach(|| drop(guard.take())));
     }
 }
 

@@ -6,6 +6,7 @@
 //! | file | contents |
 //! | --- | --- |
 //! | `endpoint.rs` | an endpoint: each call begins one operation |
+//! | `registration.rs` | the registration of an endpoint |
 //! | `operation.rs` | an operation: a future that Python polls |
 //! | `received.rs` | received messages, and their memory for numpy |
 //! | `guard.rs` | guards of outputs for protected payloads |
@@ -21,6 +22,7 @@ mod errors;
 mod guard;
 mod operation;
 mod received;
+mod registration;
 mod schema;
 
 use std::time::Duration;
@@ -84,13 +86,14 @@ mod _sinew {
     use super::{
         bag::BagReader,
         codec::{decode, encode},
-        endpoint::{Core, register},
+        endpoint::Core,
         group_tid,
         guard::OutputGuard,
         kind_of, now,
         operation::Operation,
         outcome_text,
         received::{Memory, Received},
+        registration::register,
         schema::parse_schema,
         tid_of, tid_text,
     };

@@ -3,7 +3,7 @@
 use std::{
     os::fd::{AsFd as _, AsRawFd as _},
     pin::Pin,
-    sync::{Mutex, PoisonError},
+    sync::{Arc, Mutex, PoisonError},
     task::Poll,
     time::Duration,
 };
@@ -30,7 +30,7 @@ pub(crate) enum Done {
     Nothing,
     Outcome(Outcome),
     Members(Vec<MemberOutcome>),
-    Received(sinew_client::Received),
+    Received(Arc<sinew_client::Received>),
     Resolved(Option<Tid>),
     Generation(u64),
     Registered(Box<AsyncEndpoint>),

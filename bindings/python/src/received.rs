@@ -35,7 +35,7 @@ struct Facts {
 }
 
 impl Received {
-    pub(crate) fn new(message: sinew_client::Received) -> Self {
+    pub(crate) fn new(message: Arc<sinew_client::Received>) -> Self {
         let facts = Facts {
             kind: message.kind().bits(),
             source: message.source().bits(),
@@ -48,7 +48,7 @@ impl Received {
             is_retained: message.is_retained(),
         };
         let payload = message.payload();
-        Self { message: Mutex::new(Some(Arc::new(message))), payload, facts }
+        Self { message: Mutex::new(Some(message)), payload, facts }
     }
 
     /// Returns the message for a reply; `None` after its settlement.

@@ -36,14 +36,15 @@ def program(name: str) -> str:
 class Node:
     """A node in a process of its own."""
 
-    def __init__(self, folder: pathlib.Path, name: str, program_name: str, settings: str) -> None:
+    def __init__(self, folder: pathlib.Path, name: str, program_name: str, settings: str, address: str) -> None:
         self.name = name
         self.socket = str(folder / f"{name}.sock")
         self._program = program(program_name)
         self._file = folder / f"{name}.toml"
         self._log = folder / f"{name}.log"
         self._file.write_text(
-            f"[node]\nname = '{name}'\nproject = '{folder.name}'\n[lncl]\nsocket = '{self.socket}'\n"
+            f"[node]\nname = '{name}'\nproject = '{folder.name}'\naddress = '{address}'\n"
+            f"[lncl]\nsocket = '{self.socket}'\n"
             f"[ndl]\nmdns_port = false\n{settings}"
         )
         self._process: Optional[subprocess.Popen[bytes]] = None
@@ -95,8 +96,10 @@ def start_node() -> Iterator[Callable[..., Node]]:
     folder = pathlib.Path(tempfile.mkdtemp(prefix="sinew-py-", dir="/tmp"))
     nodes: List[Node] = []
 
-    def start(name: str = "knee", program_name: str = "sinew-node", settings: str = "") -> Node:
-        nodes.append(Node(folder, name, program_name, settings))
+    def start(
+        name: str = "knee", program_name: str = "sinew-node", settings: str = "", address: str = "127.0.0.1"
+    ) -> Node:
+        nodes.append(Node(folder, name, program_name, settings, address))
         return nodes[-1]
 
     yield start

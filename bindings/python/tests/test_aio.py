@@ -157,7 +157,7 @@ def test_idle_endpoint_is_not_polled(node: Any, monkeypatch: pytest.MonkeyPatch)
 
 def test_event_loop_runs_while_operations_wait(node: Any) -> None:
     async def main() -> None:
-        async with node.register() as one, node.register() as silent:
+        async with node.register("one") as one, node.register() as silent:
             turns = 0
 
             async def turn() -> None:
@@ -171,7 +171,7 @@ def test_event_loop_runs_while_operations_wait(node: Any) -> None:
             with pytest.raises(sinew.WaitingError):
                 await node.register(requires=["nothing"], deadline=0.2)
             with pytest.raises(sinew.NotMetError):
-                await one.meet("step", ["hip"], within=0.2)
+                await one.meet("step", ["one", "hip"], within=0.2)
             turning.cancel()
             assert turns > 500, "the event loop was blocked"
 

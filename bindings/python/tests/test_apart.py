@@ -24,8 +24,9 @@ with sinew.register("hog", socket=sys.argv[1]) as me:
     pow(7, int(sys.argv[2]))  # one call that holds the GIL
     print("over", flush=True)
     for message in me:
-        if message.value == "end":
-            break
+        with message:
+            if message.value == "end":
+                break
 """
 POWER = 5_000_000
 """Enough for a second on any machine."""

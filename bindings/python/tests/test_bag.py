@@ -21,8 +21,7 @@ class Angle:
 @pytest.fixture
 def recording(start_node: Callable[..., Any], tmp_path: pathlib.Path) -> str:
     """A recording of ten angles and five texts."""
-    path = tmp_path / "walk.mcap"
-    node = start_node(settings=f"[record]\nfile = '{path}'\n")
+    node = start_node(settings=f"[record]\nfile = '{tmp_path}/walk.mcap'\n")
     with node.register("sensor") as sensor, node.register("drive") as drive:
         for number in range(10):
             sensor.send(drive.tid, Angle(number / 2, [number, -number]))
@@ -31,6 +30,8 @@ def recording(start_node: Callable[..., Any], tmp_path: pathlib.Path) -> str:
         for _ in range(15):
             assert drive.receive(20.0) is not None
     node.stop()
+    # The time of the start is in its name.
+    (path,) = tmp_path.glob("walk*.mcap")
     return str(path)
 
 

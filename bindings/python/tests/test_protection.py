@@ -84,10 +84,16 @@ def test_unprotected_command_does_not_pass_a_guard(node: Any) -> None:
             control.send_protected(sinew.group("drives"), TORQUE, 2.5)
 
 
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_output_in_use_is_not_waited_for(node: Any) -> None:
     seen: List[Any] = []
 
+    guards: List[sinew.Guard] = []
+
     def uses_its_own_guard(_: str) -> None:
+        if not guards:
+            raise RuntimeError("called again when the guard is known")
+        (guard,) = guards
         for call in (lambda: guard.cause, guard.arm, lambda: guard.apply(print), lambda: endpoint.receive(0.0)):
             with pytest.raises(sinew.BusyError, match="only trip and release"):
                 call()
@@ -96,7 +102,7 @@ def test_output_in_use_is_not_waited_for(node: Any) -> None:
 
     with node.register("control") as control, node.register("drive") as endpoint:
         guard = endpoint.guard(control.tid, TORQUE, uses_its_own_guard)
-        guard.trip()
+        guards.append(guard)
         until = time.monotonic() + LONG
         while not seen:
             assert time.monotonic() < until, "the safe function waits for itself"

@@ -4,6 +4,25 @@ from typing import Any, Callable, Dict, List, Optional, Tuple, TypeVar, Union, f
 
 from ._options import ProtectedOptions, RegisterOptions
 
+__all__ = [
+    "BagReader",
+    "Core",
+    "Memory",
+    "Operation",
+    "OutputGuard",
+    "Received",
+    "decode",
+    "encode",
+    "group_tid",
+    "kind_of",
+    "now",
+    "outcome_text",
+    "parse_schema",
+    "register",
+    "tid_of",
+    "tid_text",
+]
+
 _T = TypeVar("_T")
 _Outgoing = Tuple[Union[int, str], int, int, Union[bytes, bytearray], Optional[float], Optional[float]]
 
