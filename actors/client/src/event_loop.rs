@@ -209,6 +209,13 @@ impl EventLoop {
         self.until_polled(deadline, |cx| pending_added.as_mut().poll(cx)).await;
     }
 
+    /// Sleeps until `deadline`.
+    pub(super) async fn sleep_until(&self, deadline: Time) {
+        while Time::now() < deadline {
+            self.until_polled(deadline, |_| Poll::Pending).await;
+        }
+    }
+
     /// Sleeps until the next poll, or until `event` is ready.
     pub(super) async fn until_polled(
         &self,

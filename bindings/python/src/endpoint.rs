@@ -11,6 +11,7 @@ use sinew_client::{ApiError, AsyncEndpoint, Barrier, EventLoop, LoanedMessage, M
 use sinew_model::barrier::OnPartyLoss;
 use sinew_runtime::{
     outcome::Outcome,
+    parameters::{NamedValue, Value},
     tid::Tid,
     wire::{Class, Kind},
 };
@@ -33,6 +34,24 @@ type UndeliveredTuple = (u64, Option<String>, Option<u32>, u8, u64);
 pub(crate) enum To {
     Tid(u64),
     Name(String),
+}
+
+/// A value of a parameter. A flag is a number in Python, too, and so comes first.
+#[derive(FromPyObject)]
+enum ParameterValue {
+    Flag(bool),
+    Integer(i64),
+    Number(f64),
+}
+
+impl From<ParameterValue> for Value {
+    fn from(value: ParameterValue) -> Self {
+        match value {
+            ParameterValue::Flag(flag) => Self::Flag(flag),
+            ParameterValue::Integer(integer) => Self::Integer(integer),
+            ParameterValue::Number(number) => Self::Number(number),
+        }
+    }
 }
 
 /// A message to send: destination, kind, class, payload, seconds to wait for room, seconds until it expires.
@@ -350,6 +369,25 @@ impl Core {
             Box::pin(
                 async move { endpoint.meet(&barrier).await.map(Done::Generation).map_err(Failure::Barrier) },
             )
+        })
+    }
+
+    /// Sets parameters of several applications as one transaction: the verdict, and the outcome of each.
+    fn set_together(
+        &self,
+        py: Python<'_>,
+        sets: Vec<(String, Vec<(String, ParameterValue)>)>,
+        lead: f64,
+        within: f64,
+    ) -> PyResult<Operation> {
+        let (lead, within) = (seconds("lead", lead)?, seconds("within", within)?);
+        let named = |(name, value): (String, ParameterValue)| NamedValue { name, value: value.into() };
+        let sets = sets.into_iter().map(|(app, values)| (app, values.into_iter().map(named).collect()));
+        let sets = sets.collect();
+        self.begin(py, move |endpoint| {
+            Box::pin(async move {
+                endpoint.set_together(sets, lead, within).await.map(Done::Together).map_err(Failure::Together)
+            })
         })
     }
 

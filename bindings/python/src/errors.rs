@@ -7,7 +7,7 @@ use pyo3::{
     types::{PyAnyMethods, PyModule},
 };
 use sinew_bag::BagError;
-use sinew_client::{ApiError, BarrierError};
+use sinew_client::{ApiError, BarrierError, SetTogetherError};
 use sinew_runtime::{outcome::Outcome, protection::ArmError};
 
 /// The values of an exception beside its text.
@@ -83,6 +83,14 @@ pub(crate) fn barrier(py: Python<'_>, error: &BarrierError) -> PyErr {
         BarrierError::Refused(_) | BarrierError::Send(_) | BarrierError::Ask(_) => {
             named(py, "BarrierError", &text)
         }
+    }
+}
+
+/// Returns the exception for a transaction of parameters that did not begin.
+pub(crate) fn together(py: Python<'_>, error: &SetTogetherError) -> PyErr {
+    match error {
+        SetTogetherError::Api(error) => api(py, error),
+        SetTogetherError::Transaction(error) => named(py, "ParameterError", &error.to_string()),
     }
 }
 

@@ -13,9 +13,10 @@ use rustix::{
     event::{PollFd, PollFlags, Timespec, poll},
     io::Errno,
 };
-use sinew_client::{ApiError, AsyncEndpoint, BarrierError, EventLoop};
+use sinew_client::{ApiError, AsyncEndpoint, BarrierError, EventLoop, SetTogetherError};
 use sinew_runtime::{
     outcome::{MemberOutcome, Outcome},
+    parameters::{PartOutcome, TransactionReport},
     tid::Tid,
     time::Time,
 };
@@ -33,6 +34,7 @@ pub(crate) enum Done {
     Received(Arc<sinew_client::Received>),
     Resolved(Option<Tid>),
     Generation(u64),
+    Together(TransactionReport),
     Registered(Box<AsyncEndpoint>),
 }
 
@@ -40,6 +42,7 @@ pub(crate) enum Done {
 pub(crate) enum Failure {
     Api(ApiError),
     Barrier(BarrierError),
+    Together(SetTogetherError),
     /// The endpoint was unregistered.
     Gone,
 }
@@ -83,6 +86,7 @@ impl Operation {
             Some(Poll::Ready(Ok(done))) => self.value(py, done).map(Some),
             Some(Poll::Ready(Err(Failure::Api(error)))) => Err(errors::api(py, &error)),
             Some(Poll::Ready(Err(Failure::Barrier(error)))) => Err(errors::barrier(py, &error)),
+            Some(Poll::Ready(Err(Failure::Together(error)))) => Err(errors::together(py, &error)),
             Some(Poll::Ready(Err(Failure::Gone))) => Err(gone(py)),
         }
     }
@@ -99,6 +103,10 @@ impl Operation {
             Done::Received(received) => Received::new(received).into_py_any(py),
             Done::Resolved(tid) => tid.map(Tid::bits).into_py_any(py),
             Done::Generation(generation) => generation.into_py_any(py),
+            Done::Together(report) => {
+                let parts = report.parts.into_iter().map(|part| (part.app, in_words(part.outcome)));
+                (format!("{:?}", report.verdict), parts.collect::<Vec<_>>()).into_py_any(py)
+            }
             Done::Registered(endpoint) => Core::new(*endpoint, self.events.clone()).into_py_any(py),
         }
     }
@@ -106,6 +114,17 @@ impl Operation {
     fn drop_future(&self, py: Python<'_>) {
         let future = py.detach(|| self.future.lock().unwrap_or_else(PoisonError::into_inner).take());
         py.detach(|| drop(future));
+    }
+}
+
+/// Returns the outcome of an application in a transaction: a word, and the tick or the reason.
+fn in_words(outcome: PartOutcome) -> (&'static str, u64, String) {
+    match outcome {
+        PartOutcome::Applied { tick, .. } => ("Applied", tick, String::new()),
+        PartOutcome::Repaired { tick, .. } => ("Repaired", tick, String::new()),
+        PartOutcome::Agreed => ("Agreed", 0, String::new()),
+        PartOutcome::Refused(why) => ("Refused", 0, why),
+        PartOutcome::Unknown(why) => ("Unknown", 0, why),
     }
 }
 

@@ -64,10 +64,23 @@ def test_parameters_are_listed_set_and_undone(peer: Any) -> None:
             me.set_parameters("knee", {"assistance": "much"}, LONG)
 
 
+def test_parameters_of_several_are_set_together(peer: Any) -> None:
+    with peer.register("tuner", requires=["knee"]) as me:
+        report = me.set_together({"knee": {"assistance": 0.2, "damped": True}})
+        assert report.is_applied and report.parts["knee"].what in ("Applied", "Agreed"), report
+        assert me.parameters("knee", LONG)["assistance"].value == 0.2
+        refused = me.set_together({"knee": {"assistance": 2.0}})
+        assert refused.verdict == "None" and "2" in refused.parts["knee"].why, refused
+        with pytest.raises(sinew.ParameterError, match="no application is called hip"):
+            me.set_together({"hip": {"assistance": 0.2}})
+        with pytest.raises(TypeError, match="a parameter is a float"):
+            me.set_together({"knee": {"assistance": "much"}})
+
+
 def test_parameters_are_set_from_asyncio(peer: Any) -> None:
     async def main() -> None:
         async with peer.register(requires=["knee"]) as me:
-            await me.set_parameters("knee", {"assistance": 0.4}, LONG)
+            assert (await me.set_together({"knee": {"assistance": 0.4}})).is_applied
             assert (await me.parameters("knee", LONG))["assistance"].value == 0.4
             await me.undo_parameters("knee", LONG)
             assert (await me.parameters("knee", LONG)).undoable == 0

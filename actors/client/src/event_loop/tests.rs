@@ -144,6 +144,14 @@ fn registration_waits_without_blocking_the_thread() {
 }
 
 #[test]
+fn sleep_ends_at_its_deadline() {
+    let events = EventLoop::new().unwrap();
+    let deadline = Time::now() + Duration::from_millis(30);
+    run(&events, events.sleep_until(deadline));
+    assert!(Time::now() >= deadline);
+}
+
+#[test]
 fn waker_from_another_thread_makes_descriptor_readable() {
     let events = EventLoop::new().unwrap();
     let mut asked = false;

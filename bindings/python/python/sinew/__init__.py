@@ -27,7 +27,17 @@ from ._blocking import Endpoint
 from ._message import Message
 from ._protection import Guard, Protected
 from ._register import Registration, register
-from ._reports import Applied, NodeEvent, Parameter, ParameterList, StopNode, StopReport, Undelivered
+from ._reports import (
+    Applied,
+    NodeEvent,
+    Parameter,
+    ParameterList,
+    PartOutcome,
+    StopNode,
+    StopReport,
+    TransactionReport,
+    Undelivered,
+)
 from ._types import payload
 from ._values import BROADCAST, MemberOutcome, MessageClass, Outcome, Tid, group
 from .errors import (
@@ -93,6 +103,7 @@ __all__ = [
     "Parameter",
     "ParameterError",
     "ParameterList",
+    "PartOutcome",
     "PartyLostError",
     "Protected",
     "RefusedError",
@@ -105,6 +116,7 @@ __all__ = [
     "Tid",
     "TooLongError",
     "TooManyGroupsError",
+    "TransactionReport",
     "Undelivered",
     "UnknownNameError",
     "WaitingError",

@@ -8,9 +8,9 @@ from typing import Any, Callable, Iterable, Iterator, List, Mapping, Optional, T
 from . import _sinew
 from ._handlers import Handlers
 from ._message import Message
-from ._plans import _NOTHING, WITHIN, Destination, Options, Plan, Plans, T, outgoing
+from ._plans import _NOTHING, LEAD, WITHIN, Destination, Options, Plan, Plans, T, outgoing
 from ._protection import Guard, Protected, make_guard
-from ._reports import Applied, ParameterList, StopReport, Undelivered
+from ._reports import Applied, ParameterList, StopReport, TransactionReport, Undelivered
 from ._values import MemberOutcome, MessageClass, Outcome, Tid
 from .errors import ClosedError, DisconnectedError
 
@@ -224,6 +224,16 @@ class Endpoint:
     def set_parameters(self, app: Destination, values: Mapping[str, Any], within: float = WITHIN) -> Applied:
         """Sets parameters of an application, all or none. Raises `ParameterError` with the reason if it refuses."""
         return self._run(self._plans.set_parameters(app, values, within))
+
+    def set_together(
+        self, sets: Mapping[str, Mapping[str, Any]], *, lead: float = LEAD, within: float = 2.0
+    ) -> TransactionReport:
+        """Sets parameters of several applications, on any nodes, all or none: `{"knee": {"kp": 1.0}, "hip": {"kp": 1.0}}`.
+
+        All apply their values at their first tick at or after one stated time, `lead` seconds from now. Returns when each
+        has reported, at the latest `within` seconds after that time.
+        """
+        return self._run(self._plans.set_together(sets, lead, within))
 
     def undo_parameters(self, app: Destination, within: float = WITHIN) -> Applied:
         """Undoes the last set that was applied and not undone."""

@@ -10,7 +10,7 @@ from typing import Any, Callable, Dict, Generator, List, Mapping, Optional, Tupl
 
 from . import _sinew
 from ._message import Message
-from ._reports import Applied, ParameterList, StopReport, value_to_wire
+from ._reports import Applied, ParameterList, PartOutcome, StopReport, TransactionReport, value_to_wire
 from ._types import PayloadType, class_of_kind, from_schema, kind_id, payload_type, register_class
 from ._values import MemberOutcome, MessageClass, Outcome, Tid, class_number
 from .errors import MalformedError, NotHandledError, ParameterError, SinewError
@@ -26,6 +26,8 @@ STOP = 6
 """The application of a node that has the stop of the whole system."""
 WITHIN = 1.0
 """Default of `within`, in seconds."""
+LEAD = 0.25
+"""Default of `lead`, in seconds."""
 STOP_MARGIN = 0.5
 """Seconds beyond the wait for confirmations in which a node answers."""
 
@@ -134,6 +136,17 @@ class Plans:
     def set_parameters(self, app: Destination, values: Mapping[str, Any], within: float) -> Plan[Applied]:
         named = [{"name": name, "value": value_to_wire(value)} for name, value in values.items()]
         return (yield from self._set(app, {"Values": named}, within))
+
+    def set_together(
+        self, sets: Mapping[str, Mapping[str, Any]], lead: float, within: float
+    ) -> Plan[TransactionReport]:
+        listed = []
+        for app, values in sets.items():
+            for value in values.values():
+                value_to_wire(value)  # raises TypeError
+            listed.append((app, list(values.items())))
+        verdict, parts = yield lambda: self.core.set_together(listed, lead, within)
+        return TransactionReport(verdict, {app: PartOutcome(*outcome) for app, outcome in parts})
 
     def undo_parameters(self, app: Destination, within: float) -> Plan[Applied]:
         return (yield from self._set(app, "Undo", within))

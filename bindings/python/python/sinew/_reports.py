@@ -9,7 +9,7 @@ from ._types import PayloadType, kind_id, kind_name, register_class
 from ._values import Outcome, Tid
 from .errors import MalformedError
 
-__all__ = ["Applied", "NodeEvent", "Parameter", "ParameterList", "StopNode", "StopReport", "Undelivered"]
+__all__ = ["Applied", "NodeEvent", "Parameter", "ParameterList", "StopNode", "PartOutcome", "StopReport", "TransactionReport", "Undelivered"]
 
 ParameterValue = Union[float, int, bool]
 
@@ -114,6 +114,33 @@ class Applied:
         """Reads an outcome."""
         values = {each["name"]: value_from_wire(each["value"]) for each in wire["values"]}
         return cls(tick=wire["tick"], at=wire["at_ns"] / 1e9, values=values)
+
+
+@dataclasses.dataclass(frozen=True)
+class PartOutcome:
+    """The outcome of a transaction for one application."""
+
+    what: str
+    """ "Applied", "Repaired", "Agreed" (at its next tick), "Refused" or "Unknown"."""
+    tick: int
+    """The number of the tick; 0 without a periodic timer."""
+    why: str
+    """The reason of a refusal, or why the outcome is not known."""
+
+
+@dataclasses.dataclass(frozen=True)
+class TransactionReport:
+    """The result of a transaction of parameters over several applications."""
+
+    verdict: str
+    """ "All", "None", "Repaired" (all have the values now) or "Mixed"."""
+    parts: Dict[str, PartOutcome]
+    """The outcome of each application."""
+
+    @property
+    def is_applied(self) -> bool:
+        """Whether all applications have the values, or have them at their next tick."""
+        return self.verdict in ("All", "Repaired")
 
 
 def _seconds(micros: Optional[int]) -> Optional[float]:

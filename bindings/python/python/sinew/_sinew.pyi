@@ -67,6 +67,9 @@ class Core:
     def meet(
         self, name: str, parties: List[str], within: float, options: Tuple[bool, bool]
     ) -> Operation: ...
+    def set_together(
+        self, sets: List[Tuple[str, List[Tuple[str, Union[float, int, bool]]]]], lead: float, within: float
+    ) -> Operation: ...
     def send_protected(
         self, to: Union[int, str], payload_type: ProtectedOptions, payload: Union[bytes, bytearray]
     ) -> Operation: ...
