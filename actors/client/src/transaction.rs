@@ -97,10 +97,14 @@ impl Endpoint {
 
 impl AsyncEndpoint {
     /// Waits as the endpoint's other calls do, by tokio or by another event loop.
-    async fn sleep_until(&self, deadline: Time) {
-        match &self.endpoint.wait_mode {
-            WaitMode::Polled(events) => events.sleep_until(deadline).await,
-            WaitMode::Async(_) | WaitMode::Blocking => {
+    async fn sleep_until(&mut self, deadline: Time) {
+        let polled = match &self.endpoint.wait_mode {
+            WaitMode::Polled(events) => Some(events.clone()),
+            WaitMode::Async(_) | WaitMode::Blocking => None,
+        };
+        match polled {
+            Some(events) => events.sleep_until(deadline).await,
+            None => {
                 Clock::WALL.sleep_until(deadline).await;
             }
         }

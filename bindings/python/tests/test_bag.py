@@ -22,7 +22,8 @@ class Angle:
 def recording(start_node: Callable[..., Any], tmp_path: pathlib.Path) -> str:
     """A recording of ten angles and five texts."""
     node = start_node(settings=f"[record]\nfile = '{tmp_path}/walk.mcap'\n")
-    with node.register("sensor") as sensor, node.register("drive") as drive:
+    # The node has the names of types from those that handle or send them.
+    with node.register("sensor", handles=[Angle, "bag.text"]) as sensor, node.register("drive") as drive:
         for number in range(10):
             sensor.send(drive.tid, Angle(number / 2, [number, -number]))
             if number % 2:

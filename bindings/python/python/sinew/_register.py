@@ -83,7 +83,8 @@ def register(
     - `name`: unique on the node; without it the application has an address alone.
     - `socket`: the `lncl.socket` of the node's configuration. Without it, `$SINEW_SOCKET`.
     - `requires`: names, patterns and counts that have to be ready first, as in Rust: `["knee.drive", "camera ?2s"]`.
-    - `handles`: the types that the application handles or sends, by name or by class.
+    - `handles`: the types that the application handles or sends, by name or by class. Tools and recordings have their
+      names from here.
     - `events`: "nodes" for messages of `sinew.NodeEvent`, "requirements" for those about its requirements.
     - `deadline`: seconds for the registration, with the wait for the requirements.
     - `stall_timeout`: seconds that a send waits while the node reads nothing.
