@@ -100,9 +100,12 @@ fn picture_of_the_packages_is_true() {
         }
         shown.insert(name.to_owned());
     }
-    for package in
-        below(&packages, "sinew").iter().map(String::as_str).chain(["sinew", "sinew-c", "sinew-cli", "sinew-python"])
-    {
+    for package in below(&packages, "sinew").iter().map(String::as_str).chain([
+        "sinew",
+        "sinew-c",
+        "sinew-cli",
+        "sinew-python",
+    ]) {
         assert!(shown.contains(package), "docs/ARCHITECTURE.md does not show {package}");
     }
 }
