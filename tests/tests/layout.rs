@@ -72,9 +72,9 @@ fn no_layer_stands_on_another_one() {
 }
 
 #[test]
-fn client_and_c_library_stand_on_no_layer() {
+fn client_and_bindings_stand_on_no_layer() {
     let packages = packages();
-    for package in ["sinew-client", "sinew-c"] {
+    for package in ["sinew-client", "sinew-c", "sinew-python"] {
         let below = below(&packages, package);
         let unwanted = LAYERS.into_iter().chain([NODE, "sinew", "sinew-security", "sinew-session"]);
         for other in unwanted {
@@ -100,9 +100,12 @@ fn picture_of_the_packages_is_true() {
         }
         shown.insert(name.to_owned());
     }
-    for package in
-        below(&packages, "sinew").iter().map(String::as_str).chain(["sinew", "sinew-c", "sinew-cli"])
-    {
+    for package in below(&packages, "sinew").iter().map(String::as_str).chain([
+        "sinew",
+        "sinew-c",
+        "sinew-cli",
+        "sinew-python",
+    ]) {
         assert!(shown.contains(package), "docs/ARCHITECTURE.md does not show {package}");
     }
 }

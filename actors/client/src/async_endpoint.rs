@@ -36,6 +36,9 @@ use super::{
 /// reconnection to a node, use a thread of the runtime's blocking pool. With a direct link the endpoint polls
 /// every 20 ms, as a waiting thread does. While a direct link is full, the peer's reads wake it.
 ///
+/// One that is registered on the event loop of another library belongs to that [`EventLoop`](super::EventLoop), and
+/// needs no runtime.
+///
 /// # Examples
 ///
 /// ```no_run

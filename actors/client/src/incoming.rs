@@ -270,7 +270,7 @@ impl Endpoint {
         if self.has_unsorted() {
             return match self.wait_mode {
                 WaitMode::Blocking => {}
-                WaitMode::Async(_) => tokio::task::yield_now().await,
+                WaitMode::Async(_) | WaitMode::Polled(_) => tokio::task::yield_now().await,
             };
         }
         let deadline = self.wake_by(deadline, now, None);
@@ -285,6 +285,9 @@ impl Endpoint {
                     until,
                 ))
                 .await;
+            }
+            WaitMode::Polled(events) => {
+                yield_if_ready(events.wait(&mut self.node.reader, &self.node.writer, deadline)).await;
             }
         }
     }
@@ -320,10 +323,12 @@ impl Endpoint {
         match self.wait_mode {
             // A thread wakes at least once per `CHECK_INTERVAL` in any case.
             WaitMode::Blocking => deadline,
-            WaitMode::Async(_) if self.node.writer.has_pending() || self.direct.needs_checks() => {
+            WaitMode::Async(_) | WaitMode::Polled(_)
+                if self.node.writer.has_pending() || self.direct.needs_checks() =>
+            {
                 deadline.min(now + CHECK_INTERVAL)
             }
-            WaitMode::Async(_) => deadline,
+            WaitMode::Async(_) | WaitMode::Polled(_) => deadline,
         }
     }
 

@@ -1,13 +1,14 @@
 //! NodeAPI: for applications in processes of their own.
 //!
 //! A program connects to the node on its host through the node's unix socket, registers one or more transport
-//! addresses (*endpoints*), and sends and receives on them. It has three forms with the same semantics,
+//! addresses (*endpoints*), and sends and receives on them. Its forms have the same semantics,
 //! stated in `docs/book/src/reference/guarantees.md`:
 //!
 //! | your program is | its form | start with |
 //! | --- | --- | --- |
 //! | a plain thread, as of a control loop; no async runtime | [`Endpoint`] | [`NodeApi::register_transport_address`] |
 //! | a task of tokio | [`AsyncEndpoint`] | [`NodeApi::register_transport_address_async`] |
+//! | a task of another event loop | [`AsyncEndpoint`], [`EventLoop`] | [`NodeApi::register_transport_address_on`] |
 //! | in C or C++ | `sinew.h`, `sinew.hpp` | `bindings/c/README.md` |
 //!
 //! # Operations
@@ -175,6 +176,7 @@ mod direct_links;
 mod dispatch;
 mod endpoint;
 mod error;
+mod event_loop;
 mod inbox;
 mod incoming;
 mod link;
@@ -207,6 +209,7 @@ pub use builder::{MessageBuilder, Value};
 pub use direct_links::DirectLinks;
 pub use endpoint::Endpoint;
 pub use error::ApiError;
+pub use event_loop::EventLoop;
 pub use link::Transport;
 pub use loan::LoanedMessage;
 pub use node_api::NodeApi;

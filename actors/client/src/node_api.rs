@@ -8,7 +8,7 @@ use std::{
 use sinew_runtime::time::Time;
 
 use super::{
-    ApiError, AsyncEndpoint, Endpoint, Registration,
+    ApiError, AsyncEndpoint, Endpoint, EventLoop, Registration,
     link::{self, ServerTrust},
 };
 
@@ -132,5 +132,34 @@ impl NodeApi {
         registration: Registration,
     ) -> Result<AsyncEndpoint, ApiError> {
         AsyncEndpoint::register(&self.path, self.asking(registration)).await
+    }
+
+    /// The same for the event loop of another library, without tokio and without a thread. The endpoint has no direct
+    /// links. `events` is for this endpoint alone. Only the connection to the node's socket may block, up to 2 s, while
+    /// its queue of new connections is full.
+    ///
+    /// # Errors
+    /// Same as [`register_transport_address`](Self::register_transport_address).
+    ///
+    /// # Examples
+    ///
+    /// ```no_run
+    /// use std::pin::pin;
+    ///
+    /// use sinew::{NodeApi, Registration, client::EventLoop};
+    ///
+    /// let node = NodeApi::connect("/run/sinew/knee.sock")?;
+    /// let events = EventLoop::new()?;
+    /// let mut registering = pin!(node.register_transport_address_on(Registration::new(), events.clone()));
+    /// // The event loop watches the descriptor of `events`, and polls again when it is readable.
+    /// let _ = events.poll(registering.as_mut());
+    /// # Ok::<(), Box<dyn std::error::Error>>(())
+    /// ```
+    pub async fn register_transport_address_on(
+        &self,
+        registration: Registration,
+        events: EventLoop,
+    ) -> Result<AsyncEndpoint, ApiError> {
+        AsyncEndpoint::register_on(&self.path, self.asking(registration), events).await
     }
 }

@@ -171,17 +171,18 @@ impl NodeLink {
         let Some(until) = waiting.until(self.taken(), Time::now()) else {
             return Err(waiting.error());
         };
+        if matches!(wait_mode, WaitMode::Polled(_)) && self.reader.has_ended_now() {
+            // Its event may have been taken by a poll that did not wait for room.
+            return Err(gone());
+        }
         match (wait_mode, &mut self.rest) {
             (WaitMode::Blocking, Some(rest)) => rest.await_room(until.since(Time::now())),
             (WaitMode::Blocking, None) => self.writer.await_room(length, until),
             (WaitMode::Async(reactor), rest) => reactor.room(&self.writer, rest, length, until).await,
+            (WaitMode::Polled(events), rest) => events.room(&self.writer, rest, length, until).await,
         }
         // No room will become available any more.
-        if self.reader.has_ended_now() {
-            Err(ApiError::Closed("the node has gone".to_owned()))
-        } else {
-            Ok(())
-        }
+        if self.reader.has_ended_now() { Err(gone()) } else { Ok(()) }
     }
 
     /// Returns the node's read counter.
@@ -191,4 +192,8 @@ impl NodeLink {
             None => self.writer.taken(),
         }
     }
+}
+
+fn gone() -> ApiError {
+    ApiError::Closed("the node has gone".to_owned())
 }

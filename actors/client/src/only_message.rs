@@ -52,6 +52,7 @@ impl Endpoint {
         match self.wait_mode {
             WaitMode::Blocking => self.node.reader.look(now),
             WaitMode::Async(_) => self.look_at_rings(now),
+            WaitMode::Polled(_) => None,
         }
     }
 
@@ -92,7 +93,7 @@ impl Endpoint {
                 None => Only::Other,
             },
             (Some(Arrived::Only(index)), WaitMode::Async(_)) => self.take_only_of(index.into(), now),
-            (Some(Arrived::Several) | None, _) => Only::Other,
+            (Some(Arrived::Several | Arrived::Only(_)) | None, _) => Only::Other,
         }
     }
 

@@ -240,7 +240,7 @@ impl Endpoint {
         self.lender.check_free()?;
         let leaves_time = match self.wait_mode {
             // The registration takes that long.
-            WaitMode::Blocking => limit.leaves(ANSWER_TIMEOUT),
+            WaitMode::Blocking | WaitMode::Polled(_) => limit.leaves(ANSWER_TIMEOUT),
             // The registration runs concurrently.
             WaitMode::Async(_) => !limit.is_in_all(),
         };
@@ -258,7 +258,9 @@ impl Endpoint {
         while self.direct.has_pending() && Time::now() < deadline {
             match self.wait_mode {
                 WaitMode::Blocking => self.direct.await_pending(ROOM_PAUSE),
-                WaitMode::Async(_) => self.wait(deadline.min(Time::now() + ROOM_PAUSE), Time::now()).await,
+                WaitMode::Async(_) | WaitMode::Polled(_) => {
+                    self.wait(deadline.min(Time::now() + ROOM_PAUSE), Time::now()).await;
+                }
             }
             // A peer that waits for room itself reads nothing until it has room.
             let _ = self.poll_incoming(None, WhenFull::Refuse, Time::now());

@@ -3,10 +3,13 @@
 use std::{io, time::Duration};
 
 use sinew_runtime::{
-    protection::{Came, Cause, Guard},
+    protection::{
+        Came, Cause, Guard, OVERHEAD,
+        raw::{NotSafeError, Protected},
+    },
     tid::Tid,
     time::Time,
-    wire::{Kind, Message, Payload},
+    wire::{Class, Header, Kind, Message, Payload},
 };
 
 use super::{ApiError, AsyncEndpoint, Endpoint, Received, stall_timeout::Limit};
@@ -87,6 +90,35 @@ impl Endpoint {
         self.ends.guard::<P, O>(ends, Time::now(), output, safe)
     }
 
+    /// The same for a type that is known at run time only.
+    fn hold<O: Send + 'static>(
+        &mut self,
+        source: Tid,
+        protected: Protected,
+        output: (O, impl FnMut(&mut O, Cause) -> Result<(), NotSafeError> + Send + 'static),
+    ) -> io::Result<Guard<O>> {
+        let ends = (self.absolute(source), self.tid);
+        self.direct.keep_to_node();
+        self.ends.hold(ends, protected, Time::now(), output)
+    }
+
+    /// Sends a payload of a type that is known at run time only, in its envelope.
+    async fn send_sealed(
+        &mut self,
+        to: Tid,
+        (protected, class): (&Protected, Class),
+        payload: &[u8],
+    ) -> Result<(), ApiError> {
+        // First: a payload that cannot be sent uses up no counter.
+        self.check_length(payload.len().saturating_add(OVERHEAD))?;
+        let limit = self.stall_timeout();
+        self.prepare_send(limit)?;
+        let sealed = self.ends.seal((self.tid, self.absolute(to)), protected, payload, Time::now())?;
+        let mut header = Header::new(protected.kind, self.tid, to);
+        header.class = class;
+        self.dispatch(Message::new(header, sealed).into(), limit).await.map(drop)
+    }
+
     /// Returns a message of the value, in its envelope if its type is protected.
     pub(super) fn typed<P: Payload>(
         &mut self,
@@ -143,5 +175,33 @@ impl AsyncEndpoint {
         safe: impl FnMut(&mut O, Cause) + Send + 'static,
     ) -> io::Result<Guard<O>> {
         self.endpoint.guard::<P, O>(source, output, safe)
+    }
+
+    /// Same as [`guard`](Self::guard), for a binding to another language, which knows the type at run time only.
+    ///
+    /// # Errors
+    /// The errors of [`guard`](Self::guard).
+    #[doc(hidden)]
+    pub fn hold<O: Send + 'static>(
+        &mut self,
+        source: Tid,
+        protected: Protected,
+        output: (O, impl FnMut(&mut O, Cause) -> Result<(), NotSafeError> + Send + 'static),
+    ) -> io::Result<Guard<O>> {
+        self.endpoint.hold(source, protected, output)
+    }
+
+    /// Sends a protected payload, for a binding to another language.
+    ///
+    /// # Errors
+    /// The message was not sent.
+    #[doc(hidden)]
+    pub async fn send_sealed(
+        &mut self,
+        to: Tid,
+        typed: (&Protected, Class),
+        payload: &[u8],
+    ) -> Result<(), ApiError> {
+        self.endpoint.send_sealed(to, typed, payload).await
     }
 }

@@ -6,6 +6,7 @@ use std::{
     time::Duration,
 };
 
+use bytes::Bytes;
 use sinew_runtime::{
     outcome::{Outcome, Rejection},
     tid::Tid,
@@ -153,6 +154,12 @@ impl Received {
     #[must_use]
     pub fn bytes(&self) -> &[u8] {
         &self.message.payload
+    }
+
+    /// Returns the received payload as a value of its own, which shares the memory without a copy.
+    #[must_use]
+    pub fn payload(&self) -> Bytes {
+        self.message.payload.clone()
     }
 
     /// Decodes the payload as a `P`. Compare [`kind`](Self::kind) with `P::KIND` first. A number that does

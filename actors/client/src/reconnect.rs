@@ -8,6 +8,7 @@
 use std::{
     collections::{BTreeMap, BTreeSet},
     path::PathBuf,
+    task::Poll,
     thread,
     time::Duration,
 };
@@ -109,8 +110,8 @@ impl Reconnect {
     }
 
     /// Tries to register. Returns `None` if it has not succeeded by the deadline, or if the next try is not
-    /// due.
-    fn try_register(&mut self, until: Time) -> Option<Link> {
+    /// due. A new try waits for its answer for `answer_timeout` at least.
+    fn try_register(&mut self, until: Time, answer_timeout: Duration) -> Option<Link> {
         let attempt = self.attempt.get_or_insert_with(ReconnectAttempt::new);
         if attempt.handshake.is_none() && Time::now() < attempt.next {
             return None;
@@ -118,7 +119,7 @@ impl Reconnect {
         let (answer, until) = match attempt.handshake.take() {
             Some(handshake) => (Ok(handshake), until),
             None => {
-                let until = until.max(Time::now() + ANSWER_TIMEOUT);
+                let until = until.max(Time::now() + answer_timeout);
                 let options = self.options.clone();
                 (RegistrationHandshake::begin(&self.path, &self.register, options, until), until)
             }
@@ -207,7 +208,7 @@ impl Reconnect {
 pub(super) fn reconnect_blocking(mut reconnect: Reconnect, is_wanted: impl Fn() -> bool) -> Option<Link> {
     while is_wanted() {
         let until = Time::now() + WANTED_CHECK;
-        if let Some(link) = reconnect.try_register(until) {
+        if let Some(link) = reconnect.try_register(until, ANSWER_TIMEOUT) {
             return Some(link);
         }
         let attempt = reconnect.attempt();
@@ -236,8 +237,9 @@ impl Endpoint {
         if let Some(ended) = &self.node.ended
             && self.reconnect.applies(ended)
             && let Some(link) = match &mut self.wait_mode {
-                WaitMode::Blocking => self.reconnect.try_register(Time::now()),
+                WaitMode::Blocking => self.reconnect.try_register(Time::now(), ANSWER_TIMEOUT),
                 WaitMode::Async(reactor) => reactor.poll_reconnect(&self.reconnect),
+                WaitMode::Polled(_) => self.reconnect.try_register(Time::now(), Duration::ZERO),
             }
         {
             self.continue_on(link);
@@ -255,16 +257,24 @@ impl Endpoint {
         }
         let has_links = !self.direct.open.is_empty();
         let now = Time::now();
-        if let Some(link) = self.reconnect.try_register(if has_links { now } else { deadline }) {
+        let registered = match &self.wait_mode {
+            WaitMode::Polled(_) => self.reconnect.try_register(now, Duration::ZERO),
+            WaitMode::Blocking | WaitMode::Async(_) => {
+                self.reconnect.try_register(if has_links { now } else { deadline }, ANSWER_TIMEOUT)
+            }
+        };
+        if let Some(link) = registered {
             return self.continue_on(link);
         }
         let attempt = self.reconnect.attempt();
         let due = if attempt.handshake.is_some() { now + PAUSE.0 } else { attempt.next };
-        let left = due.min(deadline).since(Time::now());
-        if has_links {
-            self.direct.wait(left);
+        let until = due.min(deadline);
+        if let WaitMode::Polled(events) = &self.wait_mode {
+            events.until_polled(until, |_| Poll::Pending).await;
+        } else if has_links {
+            self.direct.wait(until.since(Time::now()));
         } else {
-            thread::sleep(left);
+            thread::sleep(until.since(Time::now()));
         }
     }
 
@@ -290,9 +300,12 @@ impl Endpoint {
         self.inbox.set_sink(own, writer.clone());
         (self.node, self.reconnect.attempt) = (NodeLink::new(writer, reader), None);
         self.reconnect.registrations += 1;
-        if let WaitMode::Async(reactor) = &mut self.wait_mode
-            && let Err(why) = reactor.change(&self.node.reader, &self.node.writer)
-        {
+        let watched = match &mut self.wait_mode {
+            WaitMode::Blocking => Ok(()),
+            WaitMode::Async(reactor) => reactor.change(&self.node.reader, &self.node.writer),
+            WaitMode::Polled(events) => events.watch_link(&self.node.reader, &self.node.writer),
+        };
+        if let Err(why) = watched {
             return self.abandon_reconnect(why.to_string());
         }
         if let Err(why) = self.reconnect.rejoin_groups(own, &self.node.writer, &mut self.requests) {

@@ -289,14 +289,19 @@ impl Registration {
                 Err(why) => return Err(why),
             }
         }
-        Err(match handshake.missing() {
+        Err(self.late(handshake))
+    }
+
+    /// Returns the error for a registration that is past its deadline.
+    pub(super) fn late(&self, handshake: RegistrationHandshake) -> ApiError {
+        match handshake.missing() {
             None => ApiError::NoAnswer(self.deadline),
             // The deadline passed before the node had checked the requirements.
             Some(missing) if missing.is_empty() => {
                 ApiError::Waiting { missing: self.register.requires.clone(), waited: self.deadline }
             }
             Some(missing) => ApiError::Waiting { missing, waited: self.deadline },
-        })
+        }
     }
 
     fn subscribe_kind(mut self, kind: Kind) -> Self {

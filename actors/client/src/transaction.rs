@@ -9,7 +9,7 @@ use sinew_runtime::{
     time::Time,
 };
 
-use super::{ApiError, AsyncEndpoint, Endpoint};
+use super::{ApiError, AsyncEndpoint, Endpoint, wait_mode::WaitMode};
 
 /// How long the node may take to resolve a name.
 const RESOLVED_WITHIN: Duration = Duration::from_secs(1);
@@ -96,6 +96,20 @@ impl Endpoint {
 }
 
 impl AsyncEndpoint {
+    /// Waits as the endpoint's other calls do, by tokio or by another event loop.
+    async fn sleep_until(&mut self, deadline: Time) {
+        let polled = match &self.endpoint.wait_mode {
+            WaitMode::Polled(events) => Some(events.clone()),
+            WaitMode::Async(_) | WaitMode::Blocking => None,
+        };
+        match polled {
+            Some(events) => events.sleep_until(deadline).await,
+            None => {
+                Clock::WALL.sleep_until(deadline).await;
+            }
+        }
+    }
+
     /// Sets parameters of several applications as one transaction, like [`Endpoint::set_together`].
     ///
     /// # Errors
@@ -119,9 +133,7 @@ impl AsyncEndpoint {
                     let reply = self.message(name(&transaction, index), &set).ask(within).await;
                     transaction.answered(reply.map_err(|error| error.to_string()));
                 }
-                Step::Wait(until) => {
-                    Clock::WALL.sleep_until(Time::ZERO + until).await;
-                }
+                Step::Wait(until) => self.sleep_until(Time::ZERO + until).await,
                 Step::Done => return Ok(transaction.report()),
             }
         }

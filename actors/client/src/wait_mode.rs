@@ -1,8 +1,8 @@
-//! The wait modes of an endpoint: one semantics, two ways to wait.
+//! The wait modes of an endpoint: one semantics, three ways to wait.
 //!
 //! The behaviour of an endpoint is implemented once, as futures (`endpoint.rs`, `outgoing.rs`, `incoming.rs`,
 //! `node_link.rs`, `reconnect.rs`). The mode decides only how it waits. A thread blocks in the wait, so that
-//! its futures are ready at the first poll; a task yields its thread.
+//! its futures are ready at the first poll; a task yields its thread, to tokio or to another event loop.
 
 use std::{
     future::Future,
@@ -10,7 +10,7 @@ use std::{
     task::{Context, Poll, Waker},
 };
 
-use super::reactor::Reactor;
+use super::{event_loop::EventLoop, reactor::Reactor};
 
 /// The kind of caller that waits.
 pub(super) enum WaitMode {
@@ -18,6 +18,8 @@ pub(super) enum WaitMode {
     Blocking,
     /// A task, on any thread of its runtime.
     Async(Box<Reactor>),
+    /// A task of an event loop that is not tokio's.
+    Polled(EventLoop),
 }
 
 /// Returns the value of a future of an endpoint with [`WaitMode::Blocking`]. The caller pins the future where it is

@@ -23,6 +23,7 @@ use futures_util::poll;
 use sinew_lncl::testing::{TestNode, WATCHDOG};
 use sinew_runtime::{
     outcome::{Outcome, Rejection},
+    parameters::LEAD,
     tid::Tid,
     time::Time,
     wire::{Class, Header, Kind, Message, Payload},
@@ -78,6 +79,8 @@ fn futures_are_send() {
             moves(endpoint.message(Tid::NONE, &TORQUE).confirmed(WATCHDOG)).await.unwrap();
             let message = endpoint.create_message(to, RAW, 3).unwrap();
             moves(endpoint.loaned(message).send()).await.unwrap();
+            // A transaction of no application does not begin.
+            assert!(moves(endpoint.set_together(Vec::new(), LEAD, WATCHDOG)).await.is_err());
             moves(endpoint.receive()).await.unwrap().source()
         });
         node.router().send(Message::typed(to, tid, &TORQUE)).unwrap();

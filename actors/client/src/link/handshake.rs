@@ -102,6 +102,11 @@ impl RegistrationHandshake {
         self.exchange(deadline)
     }
 
+    /// Returns the socket on which the answer arrives.
+    pub(crate) fn socket(&self) -> &UnixStream {
+        &self.socket
+    }
+
     /// Returns whether the node has ended the registration for a reason without fault, for example because it
     /// waited for the rings of a stopped process.
     pub(crate) const fn may_restart(&self) -> bool {

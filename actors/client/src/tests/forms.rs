@@ -21,7 +21,8 @@ use sinew_runtime::{
 use tokio::runtime::{Builder, Runtime};
 
 use crate::{
-    ApiError, AsyncEndpoint, Endpoint, LoanedMessage, NodeApi, Received, Registration, Transport,
+    ApiError, AsyncEndpoint, Endpoint, EventLoop, LoanedMessage, NodeApi, Received, Registration, Transport,
+    event_loop::tests::{run, run_within},
     link::ServerTrust,
 };
 
@@ -39,6 +40,8 @@ pub(super) struct Under {
 pub(super) enum Form {
     Thread,
     Task,
+    /// A task of an event loop that is not tokio's.
+    Polled,
     /// A thread that calls the functions of `sinew.h`.
     C,
 }
@@ -69,6 +72,12 @@ impl Api {
                 let endpoint = runtime.block_on(self.node.register_transport_address_async(registration))?;
                 Ok(Client::Task(endpoint, runtime))
             }
+            Form::Polled => {
+                let events = EventLoop::new().unwrap();
+                let registering = self.node.register_transport_address_on(registration, events.clone());
+                let endpoint = run(&events, registering)?;
+                Ok(Client::Polled(endpoint, events))
+            }
             Form::C => in_c::Client::register(&self.node.path, &registration).map(Client::C),
         }
     }
@@ -79,6 +88,7 @@ impl Api {
 pub(super) enum Client {
     Thread(Endpoint),
     Task(AsyncEndpoint, Runtime),
+    Polled(AsyncEndpoint, EventLoop),
     C(in_c::Client),
 }
 
@@ -102,6 +112,7 @@ macro_rules! either {
         match $client {
             Client::Thread($endpoint) => $call,
             Client::Task($endpoint, runtime) => runtime.block_on(async { $call.await }),
+            Client::Polled($endpoint, events) => run(&events, async { $call.await }),
             Client::C($endpoint) => $in_c,
         }
     };
@@ -112,7 +123,7 @@ macro_rules! check {
     ($client:expr, $endpoint:ident => $call:expr, $in_c:expr) => {
         match $client {
             Client::Thread($endpoint) => $call,
-            Client::Task($endpoint, _) => $call,
+            Client::Task($endpoint, _) | Client::Polled($endpoint, _) => $call,
             Client::C($endpoint) => $in_c,
         }
     };
@@ -268,6 +279,9 @@ impl Sending<'_, Loaned> {
             Client::Task(endpoint, runtime) => {
                 runtime.block_on(endpoint.loaned(message.of_rust()).ask_raw(within)).map(AnyReceived::Rust)
             }
+            Client::Polled(endpoint, events) => {
+                run(events, endpoint.loaned(message.of_rust()).ask_raw(within)).map(AnyReceived::Rust)
+            }
             Client::C(endpoint) => endpoint.ask_message(message.of_c(), within).map(AnyReceived::C),
         }
     }
@@ -318,7 +332,7 @@ impl Client {
     pub(super) fn transport(&self) -> Option<Transport> {
         match self {
             Self::Thread(endpoint) => Some(endpoint.transport()),
-            Self::Task(endpoint, _) => Some(endpoint.transport()),
+            Self::Task(endpoint, _) | Self::Polled(endpoint, _) => Some(endpoint.transport()),
             Self::C(_) => None,
         }
     }
@@ -364,6 +378,7 @@ impl Client {
         let received = match self {
             Self::Thread(endpoint) => endpoint.receive(within),
             Self::Task(endpoint, runtime) => runtime.block_on(within_time(within, endpoint.receive())),
+            Self::Polled(endpoint, events) => run_within(events, within, endpoint.receive()).transpose(),
             Self::C(endpoint) => return Ok(endpoint.receive(within)?.map(AnyReceived::C)),
         };
         Ok(received?.map(AnyReceived::Rust))
