@@ -41,6 +41,6 @@ pub use self::{
         ParameterVote, Participant, SetParameters, Stance, TransactionId,
     },
     param::{Cell, Param, ParamType, Parameters},
-    tuner::{ParameterError, STAGED_MAX, TICK_WITHIN, Tuner, UNDO_MAX},
+    tuner::{OwnPart, ParameterError, STAGED_MAX, TICK_WITHIN, Tuner, UNDO_MAX},
     value::{Value, ValueError},
 };

@@ -10,6 +10,7 @@ use std::{
     time::Duration,
 };
 
+pub use self::transactions::OwnPart;
 use self::transactions::Transactions;
 use crate::{
     Domain, NamedValue, PARTICIPANTS_MAX, ParameterList, ParameterOutcome, ParameterReport, Parameters,

@@ -143,20 +143,28 @@ impl Transactions {
     }
 }
 
+/// The application that takes part in a transaction.
+#[derive(Clone, Copy, Debug)]
+pub struct OwnPart {
+    /// Its TID as bits.
+    pub tid: u64,
+    /// Whether it has a loop with ticks, at which values are applied.
+    pub has_ticks: bool,
+}
+
 impl<T> Tuner<T> {
-    /// Takes part in a transaction: checks the values, holds them, and accepts. `own` is the application's TID as bits,
-    /// and `sent` the time at which the message was sent, with its maximum error; `None` if it is unknown. Repeated for
-    /// the same transaction it returns its state.
+    /// Takes part in a transaction: checks the values, holds them, and accepts. `sent` is the time at which the
+    /// message was sent, with its maximum error; `None` if it is unknown. Repeated for the same transaction it returns its
+    /// state.
     ///
     /// # Errors
     /// The values are illegal, or the transaction cannot be agreed on. Nothing is held.
     pub fn prepare(
         &mut self,
         transaction: &ParameterTransaction,
-        own: u64,
+        own: OwnPart,
         sent: Option<(Duration, Duration)>,
         now: Duration,
-        has_ticks: bool,
     ) -> Result<ParameterOutcome, ParameterError> {
         self.transactions.advance(now);
         if let Some(known) = self.transactions.outcome_of(transaction.id) {
@@ -167,7 +175,7 @@ impl<T> Tuner<T> {
         }
         let tids: BTreeSet<u64> = transaction.participants.iter().map(|one| one.tid).collect();
         let are_legal = tids.len() == transaction.participants.len() && tids.len() <= PARTICIPANTS_MAX;
-        if !are_legal || !tids.contains(&own) {
+        if !are_legal || !tids.contains(&own.tid) {
             return Err(ParameterError::Participants);
         }
         let (sent, bound) = sent.ok_or(ParameterError::UnknownClock)?;
@@ -178,8 +186,8 @@ impl<T> Tuner<T> {
         if now >= times.decide_by {
             return Err(ParameterError::TooLate);
         }
-        let values = self.check(&transaction.values, has_ticks)?;
-        let agreement = Agreement::new(transaction, own, times, now, &mut self.transactions.outbox);
+        let values = self.check(&transaction.values, own.has_ticks)?;
+        let agreement = Agreement::new(transaction, own.tid, times, now, &mut self.transactions.outbox);
         self.transactions.current =
             Some(Current { agreement, values, bound, is_holding: true, apply_at: times.apply_at });
         let held = self.transactions.outcome_of(transaction.id);

@@ -11,8 +11,8 @@ use std::{
 
 use actix::Actor;
 use sinew_params::{
-    AskParameters, ParameterError, ParameterList, ParameterOutcome, ParameterVote, Parameters, SetParameters,
-    TICK_WITHIN, Tuner,
+    AskParameters, OwnPart, ParameterError, ParameterList, ParameterOutcome, ParameterVote, Parameters,
+    SetParameters, TICK_WITHIN, Tuner,
 };
 
 use super::{Action, AppContext};
@@ -146,8 +146,8 @@ impl<A: Actor<Context = Self>> AppContext<A> {
             SetParameters::Prepare(transaction) => {
                 let sent = header.known_sent().zip(header.sent_error());
                 let sent = sent.map(|(sent, error)| (since_origin(sent), error));
-                let own = self.sender.tid().bits();
-                tuner.prepare(transaction, own, sent, since_origin(now), has_ticks).map(Some)
+                let own = OwnPart { tid: self.sender.tid().bits(), has_ticks };
+                tuner.prepare(transaction, own, sent, since_origin(now)).map(Some)
             }
             SetParameters::Conclude(id) => Ok(Some(tuner.outcome_of(*id, since_origin(now)))),
             SetParameters::Values(_) | SetParameters::Undo => {

@@ -5,6 +5,7 @@ mod world;
 use std::{sync::Arc, time::Duration};
 
 use self::world::{Plan, World};
+use super::OwnPart;
 use crate::{
     Cell, Descriptor, Domain, LEAD_MAX, NamedValue, PARTICIPANTS_MAX, Param, ParameterError,
     ParameterOutcome, ParameterTransaction, ParameterVote, Parameters, Participant, SetParameters, Stance,
@@ -66,7 +67,7 @@ fn prepare(
     transaction: &ParameterTransaction,
     now: Duration,
 ) -> Result<ParameterOutcome, ParameterError> {
-    tuner.prepare(transaction, 1, Some((ms(0), ms(0))), now, true)
+    tuner.prepare(transaction, OwnPart { tid: 1, has_ticks: true }, Some((ms(0), ms(0))), now)
 }
 
 fn stances(tuner: &mut Tuner<u32>) -> Vec<(u64, Stance)> {
@@ -115,7 +116,7 @@ fn agreed_values_apply_at_the_stated_time() {
 fn acceptance_goes_to_earlier_ones_and_is_repeated() {
     let mut tuner = Tuner::new(steps(), ms(0));
     let sent = Some((ms(0), ms(0)));
-    tuner.prepare(&transaction(4), 3, sent, ms(1), true).expect("it is legal");
+    tuner.prepare(&transaction(4), OwnPart { tid: 3, has_ticks: true }, sent, ms(1)).expect("it is legal");
     assert_eq!(stances(&mut tuner), [(1, Stance::Accepts), (2, Stance::Accepts)]);
     // The first one of each other is answered.
     vote(&mut tuner, ms(2), 1, Stance::Accepts);
@@ -228,7 +229,8 @@ fn transaction_that_cannot_be_agreed_on_is_refused_at_once() {
         let mut one = transaction(2);
         change(&mut one);
         let mut tuner: Tuner<u32> = Tuner::new(steps(), ms(0));
-        let refused = tuner.prepare(&one, 1, sent, now, true).expect_err("it is illegal");
+        let refused =
+            tuner.prepare(&one, OwnPart { tid: 1, has_ticks: true }, sent, now).expect_err("it is illegal");
         assert!(tuner.is_idle() && tuner.take_vote().is_none());
         refused
     };

@@ -6,7 +6,7 @@ use std::{
     time::Duration,
 };
 
-use super::{NEW, OLD, Steps, ms, steps, values};
+use super::{super::OwnPart, NEW, OLD, Steps, ms, steps, values};
 use crate::{
     Coordinator, ParameterOutcome, ParameterVote, Participant, SetParameters, Step, TransactionVerdict, Tuner,
 };
@@ -300,7 +300,12 @@ impl World {
         let reply = match set {
             SetParameters::Prepare(transaction) => {
                 let measured = (sent + *ahead + *late).saturating_sub(CLOCK_ERROR);
-                tuner.prepare(transaction, index as u64, Some((measured, CLOCK_ERROR)), own, true)
+                tuner.prepare(
+                    transaction,
+                    OwnPart { tid: index as u64, has_ticks: true },
+                    Some((measured, CLOCK_ERROR)),
+                    own,
+                )
             }
             SetParameters::Conclude(id) => Ok(tuner.outcome_of(*id, own)),
             // Answered before its tick, which comes in any case: nothing is killed after the stated time.
