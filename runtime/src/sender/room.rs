@@ -237,7 +237,10 @@ impl<S: Borrow<Sender> + Unpin> Future for SendWhenRoom<S> {
 /// executor. A tokio runtime that polls it must have its time enabled.
 #[derive(Debug)]
 #[must_use = "the message is sent only while this is polled"]
-pub struct ConfirmWhenRoom<S>(Result<(Waiting<S>, Option<(Wait, Duration)>), Option<SendError>>);
+pub struct ConfirmWhenRoom<S>(Result<(Waiting<S>, OpenOutcome), Option<SendError>>);
+
+/// The wait for an outcome, and its time limit; `None` once it is handed over.
+type OpenOutcome = Option<(Wait, Duration)>;
 
 impl<S: Borrow<Sender> + Unpin> Future for ConfirmWhenRoom<S> {
     type Output = Result<Confirmation, SendError>;
