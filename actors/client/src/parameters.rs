@@ -195,7 +195,8 @@ impl EndpointParameters {
         match set {
             SetParameters::Prepare(transaction) => {
                 let sent = request.sent().map(since_origin).zip(request.age_error());
-                let prepared = self.tuner.prepare(transaction, own.bits(), sent, at, has_ticks);
+                let prepared =
+                    self.tuner.prepare(transaction, OwnPart { tid: own.bits(), has_ticks }, sent, at);
                 self.answer(request, prepared);
             }
             SetParameters::Conclude(id) => {
