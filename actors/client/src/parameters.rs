@@ -5,7 +5,7 @@ use std::{fmt, pin::pin, sync::Arc, time::Duration};
 use sinew_runtime::{
     outcome::{Outcome, Rejection},
     parameters::{
-        AskParameters, ParameterError, ParameterList, ParameterOutcome, ParameterVote, Parameters,
+        AskParameters, OwnPart, ParameterError, ParameterList, ParameterOutcome, ParameterVote, Parameters,
         SetParameters, TICK_WITHIN, Tuner,
     },
     tid::Tid,
