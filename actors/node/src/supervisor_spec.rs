@@ -69,6 +69,7 @@ pub struct SupervisorSpec {
 }
 
 /// A child, at its position in the start order.
+#[expect(clippy::large_enum_variant, reason = "there are few of them, and only before the start")]
 pub(super) enum Member {
     App(DynApp),
     Supervisor(SupervisorSpec),

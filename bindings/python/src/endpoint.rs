@@ -351,17 +351,15 @@ impl Core {
         })
     }
 
-    /// Waits at a barrier: the number of its opening. `options`: whether it fails when a party is lost, and whether it
-    /// is a phase.
+    /// Waits at a barrier: the number of its opening. The last argument: the time limit in seconds, whether it fails
+    /// when a party is lost, and whether it is a phase.
     fn meet(
         &self,
         py: Python<'_>,
         name: &str,
         parties: Vec<String>,
-        within: f64,
-        options: (bool, bool),
+        (within, fails_on_loss, is_phase): (f64, bool, bool),
     ) -> PyResult<Operation> {
-        let (fails_on_loss, is_phase) = options;
         let barrier = if is_phase { Barrier::phase(name, parties) } else { Barrier::new(name, parties) };
         let on_loss = if fails_on_loss { OnPartyLoss::Fail } else { OnPartyLoss::Wait };
         let barrier = barrier.within(seconds("within", within)?).on_loss(on_loss);

@@ -349,7 +349,7 @@ fn live_views_have_the_schema_that_the_node_knows() {
         .collect();
     assert_eq!(channels, [(topic("test.angle"), "protobuf"), (topic("test.torque"), "json")]);
     let of_angles = items.iter().filter_map(|item| match item {
-        ViewItem::Message { topic, data, .. } => Some((&**topic == channels[0].0, data[..2].to_vec())),
+        ViewItem::Message { topic, data, .. } => Some((**topic == *channels[0].0, data[..2].to_vec())),
         ViewItem::Channel(_) | ViewItem::Missed { .. } => None,
     });
     // The field x is 5.
