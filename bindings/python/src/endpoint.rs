@@ -351,15 +351,18 @@ impl Core {
         })
     }
 
-    /// Waits at a barrier: the number of its opening. The last argument: the time limit in seconds, whether it fails
-    /// when a party is lost, and whether it is a phase.
+    /// Waits at a barrier: the number of its opening. `options`: whether it fails when a party is lost, and whether it
+    /// is a phase.
+    #[expect(clippy::too_many_arguments, reason = "Python calls it, and `py` is none of its arguments")]
     fn meet(
         &self,
         py: Python<'_>,
         name: &str,
         parties: Vec<String>,
-        (within, fails_on_loss, is_phase): (f64, bool, bool),
+        within: f64,
+        options: (bool, bool),
     ) -> PyResult<Operation> {
+        let (fails_on_loss, is_phase) = options;
         let barrier = if is_phase { Barrier::phase(name, parties) } else { Barrier::new(name, parties) };
         let on_loss = if fails_on_loss { OnPartyLoss::Fail } else { OnPartyLoss::Wait };
         let barrier = barrier.within(seconds("within", within)?).on_loss(on_loss);
