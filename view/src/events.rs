@@ -16,7 +16,7 @@ use crate::{
 const EVENTS_MAX: usize = 512;
 /// Facts of one snapshot. Further ones cause no events.
 const FACTS_MAX: usize = 8_192;
-/// Nodes whose lines of the log are told apart. Beyond it the latest lines may cause events again.
+/// Maximum number of nodes with a stored number of the last log line. Lines of further nodes may cause events again.
 const LOGGED_MAX: usize = 1_024;
 /// Characters of the text of an event.
 const TEXT_MAX: usize = 400;

@@ -58,8 +58,8 @@ pub(super) struct Shell {
     waiting: Vec<Waiting>,
     /// When the known nodes are read next.
     nodes_due: Time,
-    /// The latch with the presses that the core knows: a release ends no other one. So a press of an application
-    /// whose message was refused outlasts it.
+    /// The latch with the presses that the core knows. A release ends only these: a press that an application made
+    /// when the queue of the thread `stop` was full stays in force.
     covered: Latched,
     /// Number of frames and answers that were sent.
     sent: u64,

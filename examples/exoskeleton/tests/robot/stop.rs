@@ -16,6 +16,8 @@ use sinew::{AppAddress, Endpoint, NodeAddress, NodeApi, Outcome, Payload, Regist
 
 use crate::{DEADLINE, SOCKETS, alone, end, folder, start};
 
+/// The reason of the press, which is in the file of the stop.
+const REASON: &str = "a test of the stop";
 /// The joints first: central waits for them.
 const NODES: [&str; 4] = ["hip", "knee", "ankle", "central"];
 /// Time for an answer of a node.
@@ -187,12 +189,17 @@ impl Person {
     }
 }
 
-/// Waits until each node has the stop on its disk.
+/// Waits until each node has the stop on its disk: a node has the file, without a press, from its start on.
 fn wait_until_kept(folder: &Path) {
+    let has_press = |path: &Path| {
+        let content = std::fs::read(path).unwrap_or_default();
+        content.windows(REASON.len()).any(|bytes| bytes == REASON.as_bytes())
+    };
     let is_kept = |node: &str| {
-        let mut names =
+        let mut entries =
             std::fs::read_dir(folder.join(format!("{node}-state"))).into_iter().flatten().flatten();
-        names.any(|entry| entry.file_name().to_string_lossy().starts_with("stop-"))
+        entries
+            .any(|entry| entry.file_name().to_string_lossy().starts_with("stop-") && has_press(&entry.path()))
     };
     let deadline = Instant::now() + DEADLINE;
     while !NODES.iter().all(|node| is_kept(node)) {
@@ -212,7 +219,7 @@ fn stop_of_the_walking_robot_lasts_until_its_reset() {
 
     // when: the stop is pressed at the knee
     let mut button = robot.endpoint(&robot.topology.joints[Joint::Knee.index()]);
-    let report = button.press_stop("a test", WITHIN).expect("the knee answers");
+    let report = button.press_stop(REASON, WITHIN).expect("the knee answers");
 
     // then
     assert!(report.is_confirmed() && report.nodes.len() == 4, "{report:?}");

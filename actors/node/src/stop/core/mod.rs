@@ -177,7 +177,8 @@ impl Core {
                     self.outputs = outputs;
                     self.peers.values_mut().for_each(|peer| peer.due = now);
                 }
-                // spec: STOP-5. An output that is made during the stop, and whose safe function fails, takes it back.
+                // spec: STOP-5. The node withdraws its confirmation if an output is created during the stop and the
+                // safe function of that output fails.
                 if self.stopped_at.is_some() && (not_safe == 0) != self.safe_at.is_some() {
                     self.safe_at = (not_safe == 0).then_some(now);
                     self.note_change(now);
