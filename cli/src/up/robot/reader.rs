@@ -12,7 +12,10 @@ use toml::{
     de::{DeString, DeTable, DeValue},
 };
 
-use super::rows::{HOSTS_MAX, Kind, NODES_MAX, ROWS, Row, TEXT_BYTES_MAX, Table};
+use super::{
+    HERE,
+    rows::{HOSTS_MAX, Kind, NODES_MAX, ROWS, Row, TEXT_BYTES_MAX, Table},
+};
 
 /// A value of a file.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -140,8 +143,10 @@ impl Tables {
                 self.add(line, fault(&full, shown(text, value.span()), legal, remedy));
                 continue;
             };
-            if let Err(why) = check_node_name(name.get_ref()) {
-                let remedy = "choose another name, as in knee";
+            let is_this_host = table == Table::Host && name.get_ref() == HERE;
+            let checked = if is_this_host { Ok(()) } else { check_node_name(name.get_ref()) };
+            if let Err(why) = checked {
+                let remedy = "write a name as in knee";
                 self.add(line, fault(&full, quoted(name.get_ref()), format!("a name: {why}"), remedy));
                 continue;
             }
