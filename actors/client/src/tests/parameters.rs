@@ -17,7 +17,7 @@ use sinew_runtime::{
     },
 };
 
-use super::{Registration, Setpoint, TestNode, WATCHDOG};
+use super::{Registration, TORQUE, TestNode, WATCHDOG};
 use crate::{Endpoint, EndpointParameters, NodeApi};
 
 sinew::params! {
@@ -92,7 +92,8 @@ fn endpoint_serves_its_parameters_in_its_loop() {
     set(&mut tuner, "camera", &SetParameters::Undo);
     assert_eq!(camera.gains.gain.get(), 0.5);
     // Other messages are left to the program, and a question without a reply is refused.
-    tuner.message("camera", &Setpoint(1)).send().unwrap();
+    let other = tuner.message("camera", &TORQUE).confirmed(WATCHDOG).unwrap();
+    assert_eq!(other, Outcome::Delivered);
     let unsupported = tuner.message("camera", &AskParameters {}).confirmed(WATCHDOG).unwrap();
     assert_eq!(unsupported, Outcome::Rejected(Rejection::Unsupported));
     assert_eq!(camera.end(), 1);
