@@ -1,7 +1,8 @@
 //! Many transactions of parameters: four nodes on hosts of their own, each with one application, of which one is killed
 //! or cut off in any phase of the transaction.
 //!
-//! The processes share the clock of the machine, so the ticks at which they apply their values are compared on one clock.
+//! The processes share the clock of the machine, so the ticks at which they apply their values are compared on one
+//! clock.
 
 mod node;
 mod report;

@@ -125,8 +125,8 @@ impl EndpointParameters {
         other
     }
 
-    /// Applies the sets that wait, moves values with a slope, and takes the steps of a transaction. Call it at the begin
-    /// of each turn of the loop: all parameters that the turn reads belong together then.
+    /// Applies the sets that wait, moves values with a slope, and takes the steps of a transaction. Call it at the
+    /// begin of each turn of the loop: all parameters that the turn reads belong together then.
     pub fn tick(&mut self, endpoint: &mut Endpoint) {
         self.turn(Time::now());
         block_ready(pin!(self.flush(endpoint)));

@@ -96,7 +96,7 @@ pub enum ParameterError {
         "a transaction names 1 to {PARTICIPANTS_MAX} applications, each once, and the receiver among them"
     )]
     Participants,
-    /// The clock of the sender's host is not measured yet, or not well enough: its error is above an eighth of the lead.
+    /// The clock of the sender's host is not measured well enough: its error is above an eighth of the lead.
     #[error(
         "the clock of the sender's host is not known here within an eighth of the lead: send the transaction again in some seconds, or with a longer lead"
     )]

@@ -329,7 +329,7 @@ fn numbers_continue_beyond_sixteen_bits() {
 }
 
 #[test]
-fn due_ack_waits_for_arrived_messages_up_to_a_part_of_the_room() {
+fn due_ack_waits_for_a_part_of_the_room() {
     let cases =
         [(None, 32, 32), (Some(1_024), 32, 128), (Some(512), 32, 64), (Some(64), 32, 32), (Some(20), 10, 10)];
     for (room, due, overdue) in cases {

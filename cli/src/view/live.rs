@@ -175,8 +175,8 @@ impl Channels {
         }
     }
 
-    /// Returns the wanted topics that are read from a node: those of its applications, and of sources with a node out of
-    /// reach.
+    /// Returns the wanted topics that are read from a node: those of its applications, and of sources with a node out
+    /// of reach.
     fn wanted_of(&self, node: NodeAddress, here: &BTreeSet<NodeAddress>) -> BTreeSet<String> {
         let is_of = |topic: &&String| {
             self.fixed.contains(*topic)

@@ -353,7 +353,7 @@ fn connection_needs_the_token_and_the_protocol() {
 }
 
 #[test]
-fn open_server_is_read_without_the_token_by_programs_alone() {
+fn open_server_is_read_without_token_by_programs_alone() {
     const NAME: &str = "knee.gains.assistance";
     // Given
     let scenario = Scenario::new();

@@ -159,7 +159,7 @@ fn applications_of_two_nodes_are_set_together() {
 }
 
 #[test]
-fn application_in_its_own_process_takes_part_in_a_transaction() {
+fn application_in_its_own_process_joins_a_transaction() {
     let scenario = Scenario::new();
     let mut knee = scenario.start("knee", 2, &["--tuned", "--tuned-apart"]);
     knee.wait_for(&["started"]);

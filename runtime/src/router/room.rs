@@ -78,7 +78,7 @@ mod tests {
     use crate::tid::NodeAddress;
 
     #[test]
-    fn waits_of_a_node_are_bounded_and_end_when_dropped() {
+    fn waits_of_a_node_are_bounded_until_dropped() {
         let router = Arc::new(Router::new(NodeAddress::new(7)));
         let mut waits: Vec<_> = (0..ROOM_WAITS_MAX).map_while(|_| RoomWait::begin(&router)).collect();
         assert_eq!(waits.len(), ROOM_WAITS_MAX);

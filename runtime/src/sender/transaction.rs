@@ -16,7 +16,7 @@ impl Sender {
     /// [`LEAD`](crate::parameters::LEAD), 250 ms. `sets` has the name of each application and its values.
     ///
     /// The report names the tick and the time of each application. `within` is how long after the stated time this
-    /// application waits for that, and repairs: it sets the values of an application that had accepted and was restarted.
+    /// application waits for that, and repairs: it sets the values of an application that accepted and was restarted.
     /// The applications agree among themselves, so that the transaction is not lost with this application. The book's
     /// page "Tune a running loop" has the guarantee and its limits.
     ///

@@ -20,8 +20,8 @@
 //! Sinew's own lines go to standard error.
 //!
 //! With `--tuned` it runs another application, called like the node with `.gains` behind it, which has parameters and
-//! prints one of them when it changes. With `--tuned-apart` it runs one more, with `.apart` behind its name, in a process
-//! of its own.
+//! prints one of them when it changes. With `--tuned-apart` it runs one more, with `.apart` behind its name, in a
+//! process of its own.
 //!
 //! Some options cause mistakes. With `--forgets-a-handler` counts are not declared as handled. With
 //! `--sends-text-to` it sends a type with the name of a count but a text in its field, every 20 ms. With

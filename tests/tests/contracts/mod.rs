@@ -161,7 +161,7 @@ fn contract_of_two_nodes_closes_and_is_executed() {
 fn missing_contract_and_too_short_time_are_found() {
     let leg = Leg::start([]);
     let closure = leg.closure();
-    assert_eq!(closure.gaps.len(), 1);
+    assert_eq!(closure.gaps.len(), 1, "{:?}", closure.gaps);
     assert_eq!((&*closure.gaps[0].app, &*closure.gaps[0].sender), ("knee", "control"));
     let leg = Leg::start([of_control(Duration::from_millis(1_104))]);
     let closure = leg.closure();

@@ -139,7 +139,7 @@ impl Handler<Delivery<Note>> for Reader {
 }
 
 #[test]
-fn flood_that_waits_for_room_takes_no_time_and_is_noted_once() {
+fn flood_waiting_for_room_takes_no_time() {
     let both =
         replay().app(AppSpec::new("hip", || Flooder)).app(AppSpec::new("knee", || Reader).handles::<Note>());
     let outputs = both.ends_at(ms(9)).run([]).unwrap();

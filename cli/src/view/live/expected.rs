@@ -163,7 +163,7 @@ mod tests {
     }
 
     #[test]
-    fn senders_of_a_type_have_the_topics_of_a_recording() {
+    fn senders_of_a_type_have_topics_of_recordings() {
         assert_eq!(topics(&[]), ["/hip/exo.angle/view", "/ankle/exo.angle/view"]);
         assert_eq!(topics(&["hip"]), ["/hip/exo.angle/view"]);
         assert_eq!(topics(&["knee"]).len(), 2, "it receives from both");

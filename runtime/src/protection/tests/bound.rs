@@ -56,7 +56,7 @@ fn commands_that_are_all_late_keep_the_output_live() {
 proptest! {
     /// For any limits and delays, and an application that always arms its output, no output is live at the bound.
     #[test]
-    fn output_is_safe_at_the_bound_of_its_last_command(
+    fn output_is_safe_at_its_last_commands_bound(
         age_max in 8..40u32, within in 3..20u32, echo_takes in 0..20u32,
         delays in prop::collection::vec(0..50u32, 1..60),
     ) {

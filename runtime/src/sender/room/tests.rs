@@ -239,7 +239,7 @@ fn dropped_wait_sends_nothing_and_leaves_no_timer() {
 }
 
 #[test]
-fn message_to_many_or_of_class_stream_does_not_wait() {
+fn message_to_many_or_of_stream_never_waits() {
     let world = World::full();
     let unsupported = SendError::from(Rejection::Unsupported);
     let mut to_group = world.sender.message(Tid::group("sinks"), &Block(7)).room_within(SECOND).send();

@@ -2,8 +2,8 @@
 //!
 //! `cargo run --release -p sinew-tests -- params [OPTIONS]`.
 //!
-//! Exit code 1: living nodes had the values of one transaction in part, a node that was restarted or cut off did not get
-//! them afterwards, or an answer was not true.
+//! Exit code 1: living nodes had the values of one transaction in part, a node that was restarted or cut off did not
+//! get them afterwards, or an answer was not true.
 
 use std::process::ExitCode;
 

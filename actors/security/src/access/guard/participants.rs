@@ -1,5 +1,6 @@
-//! The participants of transactions of parameters. Their messages to each other need no rule: an operator has named them
-//! to the application that receives them. Without this any application could fill the queue of any other one by them.
+//! The participants of transactions of parameters. Their messages to each other need no rule: an operator has named
+//! them to the application that receives them. Without this any application could fill the queue of any other one by
+//! them.
 
 use std::{
     collections::{BTreeMap, BTreeSet, VecDeque},

@@ -240,7 +240,7 @@ fn acknowledgement_wakes_the_drainer_only_for_a_message() {
 
 // spec: SESSION-1, SESSION-3
 #[test]
-fn gathered_messages_of_a_session_are_numbered_and_sent_again() {
+fn gathered_messages_are_numbered_and_sent_again() {
     let window = Window { messages: 64, bytes: PLENTY };
     let void = Header::new(Kind::GNCL_VOID, tid(0), tid(1));
     let limits = OutletLimits { queue_capacity: 200, ..LIMITS };
