@@ -126,19 +126,8 @@ pub(crate) fn snapshot() -> Snapshot {
 
 /// Returns what the hip has measured after its start.
 fn real_time() -> RealTimeReport {
-    RealTimeReport {
-        wanted: 90,
-        granted: 60,
-        refusals: Vec::new(),
-        memory: "locked".to_owned(),
-        is_preempt_rt: false,
-        period_us: 1_000,
-        turns: 2_000,
-        p50_ns: 4_000,
-        p99_ns: 60_000,
-        p999_ns: 90_000,
-        max_ns: 210_000,
-    }
+    let (p50_ns, p99_ns, p999_ns, max_ns) = (4_000, 60_000, 90_000, 210_000);
+    RealTimeReport { granted: 60, p50_ns, p99_ns, p999_ns, max_ns, ..RealTimeReport::default() }
 }
 
 /// Returns an output of the drive of the hip.

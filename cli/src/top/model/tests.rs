@@ -68,19 +68,8 @@ fn hip(seconds: u64) -> Answers {
         links: vec![link],
         ..PeerReport::lost(KNEE, Incarnation(1))
     };
-    let real_time = RealTimeReport {
-        wanted: 90,
-        granted: 60,
-        refusals: Vec::new(),
-        memory: "locked".to_owned(),
-        is_preempt_rt: false,
-        period_us: 1_000,
-        turns: 2_000,
-        p50_ns: 4_000,
-        p99_ns: 60_000,
-        p999_ns: 90_000,
-        max_ns: 210_000,
-    };
+    let real_time =
+        RealTimeReport { granted: 60, p99_ns: 60_000, max_ns: 210_000, ..RealTimeReport::default() };
     let node = NodeReport {
         node: HIP,
         up_us: seconds * 1_000_000,
