@@ -2,7 +2,7 @@
 
 use serde_json::{Value, json};
 use sinew::inspect::{
-    IdleReport, LinkReport, NodeReport, PeerReport, RouteReport, StallReport, TroubleReport,
+    IdleReport, LinkReport, NodeReport, PeerReport, RetainedReport, RouteReport, StallReport, TroubleReport,
 };
 
 use super::{COLUMNS, real_time};
@@ -135,6 +135,7 @@ impl<'a> Row<'a> {
             "refused": result.ok().map(|report| report.refused),
             "own_stalls": result.ok().and_then(|report| report.own_stalls).map(|stalls| stalls_json(&stalls)),
             "real_time": result.ok().and_then(|report| report.real_time.as_ref()).map(real_time::json),
+            "retained": result.ok().and_then(|report| report.retained).map(|retained| retained_json(&retained)),
             "found_us": seen.and_then(|seen| seen.found_us),
             "found_by": seen.map(|seen| &seen.found_by),
             "silent_us": seen.and_then(|seen| seen.silent_us),
@@ -180,6 +181,11 @@ fn trouble_json(of: &TroubleReport) -> Value {
 fn idle_json(of: &IdleReport) -> Value {
     let IdleReport { app, name, since_us } = of;
     json!({ "app": app.to_string(), "name": name, "since_us": since_us })
+}
+
+fn retained_json(of: &RetainedReport) -> Value {
+    let RetainedReport { values, bytes, not_kept, not_handed_over } = of;
+    json!({ "values": values, "bytes": bytes, "not_kept": not_kept, "not_handed_over": not_handed_over })
 }
 
 fn stalls_json(of: &StallReport) -> Value {

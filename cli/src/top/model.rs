@@ -30,6 +30,8 @@ const NODES: &[Column] = &[
     ("LATE MAX", "late_max_us"),
     ("STALLS", "stalls"),
     ("LONGEST", "stall_longest_us"),
+    ("RETAINED", "retained_values"),
+    ("NOT RETAINED", "retained_dropped"),
 ];
 const APPS: &[Column] = &[
     ("APPLICATION", "name"),
@@ -249,7 +251,7 @@ fn node_row(node: &NodeAnswers) -> Row {
     } else {
         ("up", true)
     };
-    let measured = report.real_time.as_ref();
+    let (measured, retained) = (report.real_time.as_ref(), report.retained);
     let cells = vec![
         name,
         address,
@@ -261,6 +263,8 @@ fn node_row(node: &NodeAnswers) -> Row {
         Cell::time(measured.map(|found| found.max_ns / 1_000)),
         Cell::count(report.own_stalls.map(|stalls| stalls.count)),
         Cell::time(report.own_stalls.filter(|stalls| stalls.count > 0).map(|stalls| stalls.longest_us)),
+        Cell::count(retained.map(|of| of.values)),
+        Cell::count(retained.map(|of| of.not_kept.saturating_add(of.not_handed_over))),
     ];
     // A node of an older version does not know the stop.
     let is_released = report.stop.is_none_or(|state| state == StopState::Released);

@@ -115,6 +115,15 @@ pub(super) const RECORDER_SEEN: Metric = counter(
 );
 pub(super) const RECORDER_DROPPED: Metric =
     counter("recorder_dropped", &["node"], "Of these, the messages that are in no file.");
+pub(super) const RETAINED_VALUES: Metric =
+    gauge("retained_values", NODE, "Latest values that the node keeps for later members of groups.");
+pub(super) const RETAINED_BYTES: Metric =
+    gauge("retained_bytes", NODE, "Bytes of the retained values of the node.");
+pub(super) const RETAINED_DROPPED: Metric = counter(
+    "retained_dropped",
+    WHY,
+    "Values that later members may lack: beyond a bound of the node, or the member had no room.",
+);
 pub(super) const NODE_STOPPED: Metric =
     gauge("node_stopped", NODE, "Whether the stop of the whole system is in force at the node.");
 pub(super) const NODE_IDLE_CLIENTS: Metric =
@@ -226,6 +235,9 @@ pub const METRICS: &[Metric] = &[
     NODE_LATENESS,
     RECORDER_SEEN,
     RECORDER_DROPPED,
+    RETAINED_VALUES,
+    RETAINED_BYTES,
+    RETAINED_DROPPED,
     NODE_TROUBLED,
     NODE_IDLE_CLIENTS,
     REFUSED,

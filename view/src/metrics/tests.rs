@@ -11,8 +11,8 @@ use sinew::{
     audit::{Account, Entry, NodeAudit, Place},
     inspect::{
         AppReport, AppsReport, BarrierReport, DialReport, GuardReport, LinkReport, LostReport, Missing,
-        NodeReport, PeerReport, RealTimeReport, RecordingReport, StallReport, StreamReport, TreeLine,
-        TreeReport, WaitReport,
+        NodeReport, PeerReport, RealTimeReport, RecordingReport, RetainedReport, StallReport, StreamReport,
+        TreeLine, TreeReport, WaitReport,
     },
     message::Class,
     stop::StopState,
@@ -64,6 +64,7 @@ pub(crate) fn node_report(node: NodeAddress, name: &str) -> NodeReport {
         lost_echoes: Vec::new(),
         real_time: None,
         recording: None,
+        retained: None,
         stop: None,
         guards: Vec::new(),
         guards_left_out: 0,
@@ -100,6 +101,7 @@ pub(crate) fn snapshot() -> Snapshot {
     hip.own_stalls = Some(StallReport { count: 2, longest_us: 300_000, last_us: Some(1) });
     hip.real_time = Some(real_time());
     hip.recording = Some(RecordingReport { seen: 900, dropped: 3, ..RecordingReport::default() });
+    hip.retained = Some(RetainedReport { values: 3, bytes: 120, not_kept: 2, not_handed_over: 1 });
     hip.stop = Some(StopState::Stopped);
     hip.peers = vec![peer()];
     hip.guards = [None, Some("Silent")].map(guard).to_vec();
@@ -313,6 +315,10 @@ fn samples_have_base_units_and_the_names_of_nodes() {
         ("sinew_barrier_blocked_seconds{node=\"hip\",app=\"toe\"}", 31.0),
         ("sinew_node_fifo_priority{node=\"hip\"}", 60.0),
         ("sinew_node_stopped{node=\"hip\"}", 1.0),
+        ("sinew_retained_values{node=\"hip\"}", 3.0),
+        ("sinew_retained_bytes{node=\"hip\"}", 120.0),
+        ("sinew_retained_dropped_total{node=\"hip\",why=\"bound\"}", 2.0),
+        ("sinew_retained_dropped_total{node=\"hip\",why=\"member\"}", 1.0),
         ("sinew_node_wake_lateness_seconds{node=\"hip\",quantile=\"0.999\"}", 90e-6),
         ("sinew_guard_safe{node=\"hip\",app=\"drive\"}", 1.0),
         ("sinew_guard_safe_cause{node=\"hip\",app=\"drive\",why=\"Silent\"}", 1.0),

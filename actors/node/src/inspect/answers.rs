@@ -113,6 +113,7 @@ impl Answers {
             lost_echoes: refused::lost_echoes(state, now),
             real_time: state.real_time.report(),
             recording: Some(state.recording.report_state()),
+            retained: Some(state.ctx.router.retained().into()),
             stop: Some(state.ctx.router.stop().read().state()),
             guards,
             guards_left_out,

@@ -6,7 +6,7 @@ use sinew::{
     Tid, Time,
     address::Incarnation,
     audit::Entry,
-    inspect::{AppsReport, RealTimeReport, StallReport, TreeLine, TreeReport},
+    inspect::{AppsReport, RealTimeReport, RetainedReport, StallReport, TreeLine, TreeReport},
 };
 
 use super::*;
@@ -77,6 +77,7 @@ fn hip(seconds: u64) -> Answers {
         real_time: Some(real_time),
         peers: vec![peer],
         stop: Some(StopState::Released),
+        retained: Some(RetainedReport { values: 4, bytes: 90, not_kept: 1, not_handed_over: 2 }),
         ..node_report("hip", 7, None)
     };
     let audit = NodeAudit {
@@ -130,8 +131,21 @@ fn tables_have_states_queues_and_rates() {
     assert_eq!(
         rows(&model, "Nodes"),
         [
-            row(["hip", "192.168.0.7", "up", "released", "12.0 s", "60", "60 us", "210 us", "2", "300.0 ms"]),
-            row(["knee", "192.168.0.8", "no answer", "-", "-", "-", "-", "-", "-", "-"]),
+            row([
+                "hip",
+                "192.168.0.7",
+                "up",
+                "released",
+                "12.0 s",
+                "60",
+                "60 us",
+                "210 us",
+                "2",
+                "300.0 ms",
+                "4",
+                "3",
+            ]),
+            row(["knee", "192.168.0.8", "no answer", "-", "-", "-", "-", "-", "-", "-", "-", "-"]),
         ]
     );
     // This command itself is not shown.

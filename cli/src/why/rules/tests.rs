@@ -99,6 +99,7 @@ fn report(number: u8, name: &str, other: u8) -> NodeReport {
         lost_echoes: Vec::new(),
         real_time: None,
         recording: None,
+        retained: None,
         stop: None,
         guards: Vec::new(),
         guards_left_out: 0,
