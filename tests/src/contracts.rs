@@ -3,8 +3,8 @@
 //!
 //! The processes share the monotonic clock of the machine, so one clock measures the time from the last command, or
 //! from the order to stop, to a safe output. The times are upper bounds: the last command before a kill or a pause was
-//! sent up to one period earlier, and that period is added. Commands that arrive late are injected in the tests of the
-//! guard.
+//! sent up to one period earlier, and that period is added. Commands become late when the echoes that they quote do: the
+//! time counts from the first echo that is held back.
 
 mod node;
 mod report;
@@ -42,6 +42,8 @@ enum Injection {
     Kill,
     /// The process of the sender is paused.
     Pause,
+    /// The echoes to the sender are held back, so that its commands are late.
+    Delay,
     /// The node of the sender stops in order.
     Leave,
     /// The stop of the whole system is pressed.
@@ -49,7 +51,7 @@ enum Injection {
 }
 
 impl Injection {
-    const ALL: [Self; 4] = [Self::Kill, Self::Pause, Self::Leave, Self::Press];
+    const ALL: [Self; 5] = [Self::Kill, Self::Pause, Self::Delay, Self::Leave, Self::Press];
 
     const fn of_round(round: u32) -> Self {
         Self::ALL[round as usize % Self::ALL.len()]
@@ -60,8 +62,8 @@ impl Injection {
         match self {
             // With the last command.
             Self::Kill | Self::Pause => PERIOD,
-            // Commands are sent until the order is executed.
-            Self::Leave | Self::Press => Duration::ZERO,
+            // Good commands are sent later, too: until the order is executed, or the newest echo is too old.
+            Self::Delay | Self::Leave | Self::Press => Duration::ZERO,
         }
     }
 }
@@ -89,6 +91,7 @@ fn play(system: &mut System, injection: Injection, report: &mut Report) {
     match injection {
         Injection::Kill => system.kill_central(),
         Injection::Pause => system.pause_central(),
+        Injection::Delay => system.delay_central(),
         Injection::Leave => system.order_central_to_leave(),
         Injection::Press => system.press(PRESS_WITHIN),
     }
@@ -107,6 +110,7 @@ fn play(system: &mut System, injection: Injection, report: &mut Report) {
     match injection {
         Injection::Kill | Injection::Leave => system.start_central(),
         Injection::Pause => system.resume_central(),
+        Injection::Delay => system.end_delay(),
         Injection::Press => system.release(),
     }
 }

@@ -103,14 +103,16 @@ impl Handler<Delivery<Torque>> for Drive {
     fn handle(&mut self, _: Delivery<Torque>, _: &mut Self::Context) {}
 }
 
-/// `NUMBER GROUP PROJECT FOLDER SLACK_MS PLANT`. With the plant `missing` a drive declares no contract, with `short`
+/// `NUMBER GROUP PROJECT FOLDER SLACK_MS PLANT [ANNOUNCE]`, with the address for the other nodes. With the plant `missing` a drive declares no contract, with `short`
 /// one of too short a time, with `none` a correct one.
 pub(crate) fn run(arguments: &[String]) {
-    let [number, group, project, folder, slack, plant] = arguments else {
-        panic!("six arguments, not {arguments:?}")
+    let [number, group, project, folder, slack, plant, announce @ ..] = arguments else {
+        panic!("six arguments and more, not {arguments:?}")
     };
     let number: u8 = number.parse().expect("the scenario counts");
     let group: SocketAddrV4 = group.parse().expect("the scenario's group");
+    let announce: Option<SocketAddrV4> =
+        announce.first().map(|address| address.parse().expect("an address of the scenario's network"));
     let name = NODES[usize::from(number)];
     let slack = Duration::from_millis(slack.parse().expect("milliseconds"));
     let project = format!("contracts-{project}");
@@ -121,6 +123,7 @@ pub(crate) fn run(arguments: &[String]) {
         (config.ndl.multicast, config.ndl.mdns_port) = (Some(group), None);
         config.ndl.period = Duration::from_millis(100);
         config.rt.probe = Duration::ZERO;
+        config.gncl.announce = announce;
         (config.contracts.dry_run, config.contracts.slack) = (true, slack);
     });
     let (operator, key) = sender_app(&format!("operator.{name}"));
@@ -133,6 +136,7 @@ pub(crate) fn run(arguments: &[String]) {
     };
     let node = builder.start().unwrap_or_else(|error| panic!("{error}"));
     node.handle().wait_until_running(DEADLINE).expect("it requires nothing");
+    println!("up {}", node.handle().gncl_address().expect("its layers are ready"));
     execute_orders(&key.sender(), node.handle().address(), &view);
     node.stop();
 }
@@ -156,7 +160,6 @@ fn drive(name: &str, view: &Arc<View>, within: Duration, plant: &str) -> AppSpec
 
 /// Executes the orders of the scenario, and prints one line for each.
 fn execute_orders(operator: &Sender, own: NodeAddress, view: &View) {
-    println!("up");
     for line in std::io::stdin().lock().lines().map_while(Result::ok) {
         let words: Vec<&str> = line.split(' ').collect();
         match words[..] {

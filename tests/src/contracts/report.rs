@@ -15,7 +15,7 @@ const SHOWN_MAX: usize = 20;
 pub struct Report {
     /// Number of injected conditions.
     pub rounds: u32,
-    /// Time from the last command, or from the order, until an output was safe: killed, paused, left in order, pressed.
+    /// Time from the last command, or from the order, until an output was safe; indexed by the injection.
     pub times: [Times; Injection::ALL.len()],
     /// The longest dry run at the start.
     pub dry_run: Option<Duration>,
@@ -49,6 +49,7 @@ impl Report {
         json!({
             "bench": "contracts", "rounds": self.rounds, "violations": self.violation_count,
             "lost": times[Injection::Kill as usize], "paused": times[Injection::Pause as usize],
+            "late": times[Injection::Delay as usize],
             "stopped": times[Injection::Leave as usize], "stopped_by_press": times[Injection::Press as usize],
             "within_ms": WITHIN.as_millis() as u64, "dry_run_ms": self.dry_run.map(|time| time.as_secs_f64() * 1e3),
         })
@@ -70,6 +71,7 @@ impl fmt::Display for Report {
             let name = match injection {
                 Injection::Kill => "lost: its process is killed",
                 Injection::Pause => "lost: its process is paused",
+                Injection::Delay => "late: the echoes to it are held back",
                 Injection::Leave => "stopped: its node stops in order",
                 Injection::Press => "stopped: the stop of the system is pressed",
             };
