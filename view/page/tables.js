@@ -19,9 +19,9 @@ function facts(node) {
     ["Security", report.is_open === null ? "-" : report.is_open ? "open" : "keys"],
   ];
   if (report.real_time) {
-    const { granted, wanted, max_us, refusals } = report.real_time;
+    const { granted, wanted, max_us, refusals, memory } = report.real_time;
     const why = granted < wanted ? ` (refused: ${refusals.join("; ") || "no reason given"})` : "";
-    lines.push(["Real time", `priority ${granted} of ${wanted}${why}, at most ${short(max_us)} µs late`]);
+    lines.push(["Real time", `priority ${granted} of ${wanted}${why}, memory ${memory}, at most ${short(max_us)} µs late`]);
   }
   const recording = report.recording;
   if (recording) {

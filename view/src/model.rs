@@ -84,7 +84,7 @@ fn report(node: &NodeReport, labels: &NodeLabels) -> Value {
         "stalls": node.own_stalls.map(|stalls| stalls.count),
         "real_time": node.real_time.as_ref().map(|found| json!({
             "granted": found.granted, "wanted": found.wanted, "max_us": found.max_ns as f64 / 1e3,
-            "refusals": found.refusals,
+            "refusals": found.refusals, "memory": found.memory,
         })),
         "recording": node.recording.as_ref().map(|found| json!({
             "is_configured": found.is_configured, "programs": found.programs,

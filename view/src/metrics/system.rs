@@ -6,9 +6,9 @@ use super::{
     samples::Samples,
     table::{
         AGE, ENTRY_UP, FOXGLOVE_CLIENTS, FOXGLOVE_DROPPED, FOXGLOVE_MESSAGES, LEFT_OUT, NODE_FIFO,
-        NODE_IDLE_CLIENTS, NODE_LATENESS, NODE_LOST, NODE_STALL_LONGEST, NODE_STALLS, NODE_STOPPED,
-        NODE_STOPPING, NODE_TROUBLED, NODE_UP, NODE_UPTIME, RECORDER_DROPPED, RECORDER_SEEN, REFUSED,
-        RETAINED_BYTES, RETAINED_DROPPED, RETAINED_VALUES, TOOK,
+        NODE_IDLE_CLIENTS, NODE_LATENESS, NODE_LOST, NODE_MEMORY, NODE_STALL_LONGEST, NODE_STALLS,
+        NODE_STOPPED, NODE_STOPPING, NODE_TROUBLED, NODE_UP, NODE_UPTIME, RECORDER_DROPPED, RECORDER_SEEN,
+        REFUSED, RETAINED_BYTES, RETAINED_DROPPED, RETAINED_VALUES, TOOK,
     },
 };
 use crate::{
@@ -75,6 +75,7 @@ pub(super) fn add_node(samples: &mut Samples, answers: &Answers, label: &str) {
     }
     if let Some(measured) = &node.real_time {
         samples.level(&NODE_FIFO, [label], measured.granted.into());
+        samples.level(&NODE_MEMORY, [label], truth(measured.memory == "locked"));
         let quantiles = [
             ("0.5", measured.p50_ns),
             ("0.99", measured.p99_ns),

@@ -103,6 +103,11 @@ pub(super) const NODE_FIFO: Metric = gauge(
     NODE,
     "Priority of SCHED_FIFO that the node got when it measured after its start; 0 if it was refused.",
 );
+pub(super) const NODE_MEMORY: Metric = gauge(
+    "node_memory_locked",
+    NODE,
+    "Whether all memory of the node's process was locked when it measured after its start.",
+);
 pub(super) const NODE_LATENESS: Metric = seconds(
     "node_wake_lateness",
     &["node", "quantile"],
@@ -231,6 +236,7 @@ pub const METRICS: &[Metric] = &[
     NODE_STALLS,
     NODE_STALL_LONGEST,
     NODE_FIFO,
+    NODE_MEMORY,
     NODE_STOPPED,
     NODE_LATENESS,
     RECORDER_SEEN,

@@ -129,7 +129,8 @@ pub(crate) fn snapshot() -> Snapshot {
 /// Returns what the hip has measured after its start.
 fn real_time() -> RealTimeReport {
     let (p50_ns, p99_ns, p999_ns, max_ns) = (4_000, 60_000, 90_000, 210_000);
-    RealTimeReport { granted: 60, p50_ns, p99_ns, p999_ns, max_ns, ..RealTimeReport::default() }
+    let memory = "locked".to_owned();
+    RealTimeReport { granted: 60, memory, p50_ns, p99_ns, p999_ns, max_ns, ..RealTimeReport::default() }
 }
 
 /// Returns an output of the drive of the hip.
@@ -314,6 +315,7 @@ fn samples_have_base_units_and_the_names_of_nodes() {
         ("sinew_barrier_wait_seconds{node=\"hip\",app=\"drive\"}", 7.0),
         ("sinew_barrier_blocked_seconds{node=\"hip\",app=\"toe\"}", 31.0),
         ("sinew_node_fifo_priority{node=\"hip\"}", 60.0),
+        ("sinew_node_memory_locked{node=\"hip\"}", 1.0),
         ("sinew_node_stopped{node=\"hip\"}", 1.0),
         ("sinew_retained_values{node=\"hip\"}", 3.0),
         ("sinew_retained_bytes{node=\"hip\"}", 120.0),
