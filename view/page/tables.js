@@ -89,7 +89,7 @@ function appRow(app) {
     word,
     app.state,
     app.restarts === null ? "-" : `${app.restarts}`,
-    app.waiting === null ? "-" : `${app.waiting} (most ${app.waiting_most ?? "-"})`,
+    app.waiting === null ? "-" : `${app.waiting} (most ${app.waiting_most ?? "-"}${app.oldest_ms === null ? "" : `, oldest ${short(app.oldest_ms)} ms`})`,
     app.place,
     app.ended ?? app.last_reason ?? "",
   ];

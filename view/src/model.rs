@@ -134,6 +134,7 @@ fn app(app: &AppReport, line: Option<&TreeLine>, label: &str) -> Value {
         "last_reason": line.and_then(|line| line.last_reason.as_ref()),
         "place": line.and_then(|line| line.place.as_ref()),
         "waiting": line.and_then(|line| line.waiting), "waiting_most": line.and_then(|line| line.waiting_most),
+        "oldest_ms": line.and_then(|line| line.oldest_us).map(|micros| micros as f64 / 1e3),
     })
 }
 

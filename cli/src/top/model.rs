@@ -41,6 +41,7 @@ const APPS: &[Column] = &[
     ("DIRECT OUT/S", "direct_out_per_s"),
     ("WAITING", "waiting"),
     ("MOST", "waiting_most"),
+    ("OLDEST", "oldest_us"),
     ("RESTARTS", "restarts"),
     ("GUARD", "guard"),
 ];
@@ -299,6 +300,7 @@ fn app_row(pair: &Pair<'_>, app: &AppReport) -> Row {
         if has_direct { pair.rate(direct_out) } else { Cell::Unknown },
         Cell::Count(waiting),
         Cell::count(line.and_then(|line| line.waiting_most)),
+        Cell::time(line.and_then(|line| line.oldest_us)),
         Cell::count(line.map(|line| line.restarts)),
         guard,
     ];

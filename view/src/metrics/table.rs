@@ -184,6 +184,11 @@ pub(super) const RESTARTS: Metric =
 pub(super) const MAILBOX_DEPTH: Metric = gauge("mailbox_depth", APP, "Messages in the mailbox.");
 pub(super) const MAILBOX_DEPTH_MAX: Metric =
     gauge("mailbox_depth_max", APP, "The most messages that were ever in the mailbox at once.");
+pub(super) const MAILBOX_OLDEST: Metric = seconds(
+    "mailbox_oldest",
+    APP,
+    "Age of the oldest message in the mailbox, since it was sent; 0 if none waits.",
+);
 
 pub(super) const GUARD_SAFE: Metric =
     gauge("guard_safe", APP, "Whether an output that the application guards is safe: no command reaches it.");
@@ -270,6 +275,7 @@ pub const METRICS: &[Metric] = &[
     RESTARTS,
     MAILBOX_DEPTH,
     MAILBOX_DEPTH_MAX,
+    MAILBOX_OLDEST,
     GUARD_SAFE,
     GUARD_CAUSE,
     GUARD_FAILED,

@@ -221,6 +221,7 @@ fn tree(of: &NodeReport) -> TreeReport {
         place: None,
         waiting: Some(5),
         waiting_most: Some(17),
+        oldest_us: Some(1_500),
         strategy: None,
     };
     TreeReport { name: of.name.clone(), lines: vec![line], left_out: 0 }
@@ -310,6 +311,7 @@ fn samples_have_base_units_and_the_names_of_nodes() {
         ("sinew_peer_clock_offset_seconds{node=\"hip\",peer=\"knee\"}", -0.000_002),
         ("sinew_link_up{node=\"hip\",peer=\"knee\",class=\"control\"}", 1.0),
         ("sinew_restarts_total{node=\"hip\",app=\"drive\"}", 2.0),
+        ("sinew_mailbox_oldest_seconds{node=\"hip\",app=\"drive\"}", 0.0015),
         ("sinew_mailbox_depth_max{node=\"hip\",app=\"drive\"}", 17.0),
         ("sinew_barrier_wait_seconds{node=\"hip\",app=\"gait\"}", 31.0),
         ("sinew_barrier_wait_seconds{node=\"hip\",app=\"drive\"}", 7.0),

@@ -44,6 +44,7 @@ fn tree() -> TreeReport {
         place: None,
         waiting: Some(3),
         waiting_most: Some(9),
+        oldest_us: Some(1_500),
         strategy: None,
     };
     TreeReport { name: "hip".to_owned(), lines: vec![line], left_out: 0 }
@@ -151,7 +152,7 @@ fn tables_have_states_queues_and_rates() {
     // This command itself is not shown.
     assert_eq!(
         rows(&model, "Applications"),
-        [row(["drive", "hip", "ready", "50.0", "-", "3", "9", "1", "-"])]
+        [row(["drive", "hip", "ready", "50.0", "-", "3", "9", "1.5 ms", "1", "-"])]
     );
     assert_eq!(
         rows(&model, "Links"),

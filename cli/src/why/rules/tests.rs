@@ -134,6 +134,7 @@ fn app(name: &str) -> App {
         place: None,
         waiting: Some(0),
         waiting_most: Some(3),
+        oldest_us: None,
         strategy: None,
     };
     App { report: Some(report), unreported: None, line: Some(line), refused: 0, direct: Vec::new() }
