@@ -39,10 +39,14 @@ pub(crate) struct Arguments {
 #[derive(Debug, Subcommand)]
 pub(crate) enum Command {
     /// Shows every node: address, name, up time, state, validity of its keys (or OPEN), links and round-trip time
+    ///
+    /// While the stop of the system is in force, its presses and the nodes that have not confirmed stand above the
+    /// table, and the column STOP has the confirmation of each node. That is a finding, like a node that is lost.
     #[command(after_help = r#"Examples:
   sinew nodes
-  sinew nodes --wide            all columns: incarnation, routes, bounds, clock, drift
-  sinew nodes --json | jq -r '.nodes[].name'"#)]
+  sinew nodes --wide            all columns: incarnation, stop, routes, bounds, clock, drift
+  sinew nodes --json | jq -r '.nodes[].name'
+  sinew nodes --json | jq .stop"#)]
     Nodes,
     /// Shows every application: TID, name, node, and whether it is ready or why not
     #[command(after_help = r#"Examples:

@@ -2,13 +2,14 @@
 
 mod real_time;
 mod row;
+mod stop;
 
 use std::{collections::BTreeSet, fmt::Display};
 
 use serde_json::{Value, json};
 use sinew::inspect::{AskNode, IdleReport, LostReport, NodeReport, SourceReport, StallReport, TroubleReport};
 
-use self::row::Row;
+use self::{row::Row, stop::Stop};
 use crate::{
     Report, output,
     system::{System, SystemError},
@@ -17,9 +18,11 @@ use crate::{
 };
 
 /// Columns of the table.
-const COLUMNS: usize = 14;
+const COLUMNS: usize = 15;
 /// The default columns: node, name, up, state, keys, found by, links, round trip.
-const SHORT: [usize; 8] = [0, 1, 3, 4, 5, 6, 7, 11];
+const SHORT: &[usize] = &[0, 1, 3, 4, 6, 7, 8, 12];
+/// The default columns while the stop of the system is in force: the same, and its confirmations.
+const SHORT_STOPPED: &[usize] = &[0, 1, 3, 4, 5, 6, 7, 8, 12];
 
 /// Asks every node. If the socket `is_searched`, nodes of other projects may be meant: they are noted.
 pub(crate) fn show(system: &mut System, is_wide: bool, is_searched: bool) -> Result<Report, SystemError> {
@@ -30,23 +33,25 @@ pub(crate) fn show(system: &mut System, is_wide: bool, is_searched: bool) -> Res
         output::note(note);
     }
     let answers = system.ask_all::<AskNode, NodeReport>(&here);
+    let stop = Stop::ask(system, &answers);
     let rows: Vec<_> = answers.iter().map(|answer| Row::of(&here, answer)).collect();
     let lost: Vec<_> =
         here.lost.iter().filter(|lost| rows.iter().all(|row| row.answer.node != lost.node)).collect();
     // A node that has left in order is not missing.
     let none_is_missed = here.lost.iter().all(|lost| lost.why == "left");
     let are_all_told = here.left_out == 0 && here.lost_left_out == 0;
-    let is_fine = rows.iter().all(Row::is_fine) && are_all_told && none_is_missed;
+    let is_fine = rows.iter().all(Row::is_fine) && are_all_told && none_is_missed && stop.is_none();
     let json = json!({
         "through": system.path,
         "here": here.node.to_string(),
+        "stop": stop.as_ref().map(Stop::json),
         "nodes": rows.iter().map(Row::json).collect::<Vec<_>>(),
         "sources": here.sources.iter().map(source_json).collect::<Vec<_>>(),
         "lost": here.lost.iter().map(lost_json).collect::<Vec<_>>(),
         "left_out": here.left_out,
         "lost_left_out": here.lost_left_out,
     });
-    Ok(Report { text: text(&here, &rows, &lost, is_wide), json, is_fine })
+    Ok(Report { text: text(&here, &rows, &lost, (stop.as_ref(), is_wide)), json, is_fine })
 }
 
 /// Returns which of several projects of this host is shown.
@@ -62,7 +67,7 @@ fn others_note(path: &str, project: &str, others: &BTreeSet<String>) -> Option<S
     })
 }
 
-fn lost_cells(lost: &LostReport) -> [String; COLUMNS] {
+fn lost_cells(lost: &LostReport, stop: String) -> [String; COLUMNS] {
     let dash = || "-".to_owned();
     let found_by = or_dash(Some(lost.found_by.join(", ")).filter(|words| !words.is_empty()));
     let incarnation = lost.incarnation.to_string();
@@ -72,6 +77,7 @@ fn lost_cells(lost: &LostReport) -> [String; COLUMNS] {
         incarnation,
         dash(),
         "lost".to_owned(),
+        stop,
         dash(),
         found_by,
         dash(),
@@ -161,13 +167,19 @@ fn idle(row: &Row<'_>) -> String {
     lines
 }
 
-fn text(here: &NodeReport, rows: &[Row<'_>], lost: &[&LostReport], is_wide: bool) -> String {
+fn text(
+    here: &NodeReport,
+    rows: &[Row<'_>],
+    lost: &[&LostReport],
+    (stop, is_wide): (Option<&Stop>, bool),
+) -> String {
     let heading: [_; COLUMNS] = [
         "NODE",
         "NAME",
         "INCARNATION",
         "UP",
         "STATE",
+        "STOP",
         "KEYS",
         "FOUND BY",
         "LINKS",
@@ -178,14 +190,20 @@ fn text(here: &NodeReport, rows: &[Row<'_>], lost: &[&LostReport], is_wide: bool
         "CLOCK",
         "DRIFT",
     ];
-    let cells = rows.iter().map(Row::cells).chain(lost.iter().map(|lost| lost_cells(lost)));
-    let mut text = if is_wide {
+    let lost_row = |lost: &&LostReport| lost_cells(lost, stop::cell(stop, lost.node, None));
+    let cells = rows.iter().map(|row| row.cells(stop)).chain(lost.iter().map(lost_row));
+    let mut text = stop.map(Stop::lines).unwrap_or_default();
+    text += &if is_wide {
         let mut table = Table::new(heading).wide(true);
         cells.for_each(|cells| table.row(cells));
         table.text()
     } else {
-        let mut table = Table::new(SHORT.map(|column| heading[column])).whole(&["NODE", "UP", "ROUND TRIP"]);
-        cells.for_each(|cells| table.row(SHORT.map(|column| cells[column].clone())));
+        let columns = if stop.is_some() { SHORT_STOPPED } else { SHORT };
+        let headings: Vec<_> = columns.iter().map(|&column| heading[column]).collect();
+        let mut table = Table::of(&headings).whole(&["NODE", "UP", "ROUND TRIP"]);
+        for cells in cells {
+            table.add(&columns.iter().map(|&column| cells[column].clone()).collect::<Vec<_>>());
+        }
         table.text()
     };
     text.extend(sources(here));
@@ -281,9 +299,9 @@ mod tests {
         };
         let answer = answer(here.clone());
         let rows = [Row { answer: &answer, seen: Some(&seen) }];
-        let shown = text(&here, &rows, &[], false);
+        let shown = text(&here, &rows, &[], (None, false));
         assert!(widest(&shown) <= WIDTH && shown.contains("192.168.0.7  "), "{shown}");
-        assert!(widest(&text(&here, &rows, &[], true)) > WIDTH);
+        assert!(widest(&text(&here, &rows, &[], (None, true))) > WIDTH);
     }
 
     #[test]
@@ -301,7 +319,7 @@ mod tests {
     fn left_out_nodes_are_counted() {
         let here =
             NodeReport { left_out: 2, lost_left_out: 3, ..security::tests::node_report("knee", 7, None) };
-        let shown = text(&here, &[], &[], false);
+        let shown = text(&here, &[], &[], (None, false));
         let lines = "2 further nodes had no room in the answer of 192.168.0.7\n\
                      3 further lost nodes had no room in the answer of 192.168.0.7\n";
         assert!(shown.ends_with(lines), "{shown}");

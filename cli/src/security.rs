@@ -152,6 +152,7 @@ pub(crate) mod tests {
             lost_echoes: Vec::new(),
             real_time: None,
             recording: None,
+            retained: None,
             stop: None,
             guards: Vec::new(),
             guards_left_out: 0,

@@ -8,7 +8,7 @@ use sinew::{
     AppAddress, Outcome, Payload, Tid,
     client::ApiError,
     message::Rejection,
-    stop::{AskStop, PressStop, ReleaseStop, StopNode, StopReport, StopState},
+    stop::{AskStop, PressStop, ReleaseStop, StopNode, StopPress, StopReport, StopState},
 };
 use sinew_view::StopAct;
 
@@ -86,8 +86,7 @@ pub(crate) fn show(system: &mut System, order: &Order, is_wide: bool) -> Result<
             (report, is_fine)
         }
         Order::Status => {
-            let within = system.within.as_millis().try_into().unwrap_or(u32::MAX);
-            let report = ask(system, &AskStop {}, within)?;
+            let report = status(system)?;
             let is_fine = is_free(&report) && report.state == StopState::Released;
             (report, is_fine)
         }
@@ -95,13 +94,16 @@ pub(crate) fn show(system: &mut System, order: &Order, is_wide: bool) -> Result<
     Ok(Report { text: text(&report, is_wide), json: in_json(&report), is_fine })
 }
 
+/// Returns the state of the stop, as the entry node knows it.
+pub(crate) fn status(system: &mut System) -> Result<StopReport, SystemError> {
+    let within = system.within.as_millis().try_into().unwrap_or(u32::MAX);
+    ask(system, &AskStop {}, within)
+}
+
 /// Carries out an act of the page.
 pub(crate) fn act(system: &mut System, act: StopAct) -> Result<StopReport, SystemError> {
     match act {
-        StopAct::Ask => {
-            let within = system.within.as_millis().try_into().unwrap_or(u32::MAX);
-            ask(system, &AskStop {}, within)
-        }
+        StopAct::Ask => status(system),
         StopAct::Press => {
             let reason = "pressed on the page of sinew view".to_owned();
             ask(system, &PressStop { reason, within_ms: PAGE_WITHIN_MS }, PAGE_WITHIN_MS)
@@ -152,8 +154,7 @@ fn text(report: &StopReport, is_wide: bool) -> String {
         text += &format!("refused: {}\n", clean(why));
     }
     for press in &report.presses {
-        let reason = clean(&press.reason);
-        text += &format!("pressed at node {} by {}: {reason}\n", press.node, press.by);
+        text += &format!("{}\n", press_line(press));
     }
     let mut table = Table::new(["NODE", "NAME", "STATE", "CONFIRMED", "OUTPUTS", "NOTE"]).wide(is_wide);
     for node in &report.nodes {
@@ -174,6 +175,11 @@ fn text(report: &StopReport, is_wide: bool) -> String {
     text
 }
 
+/// Returns a press in one line.
+pub(crate) fn press_line(press: &StopPress) -> String {
+    format!("pressed at node {} by {}: {}", press.node, press.by, clean(&press.reason))
+}
+
 /// Returns the word for a state; `None` is that of a node without an answer.
 pub(crate) const fn state(state: Option<StopState>) -> &'static str {
     match state {
@@ -191,11 +197,11 @@ fn note(node: &StopNode) -> String {
     }
 }
 
-fn millis(micros: u64) -> String {
+pub(crate) fn millis(micros: u64) -> String {
     format!("{}.{} ms", micros / 1_000, micros % 1_000 / 100)
 }
 
-fn in_json(report: &StopReport) -> Json {
+pub(crate) fn in_json(report: &StopReport) -> Json {
     let presses = report.presses.iter().map(|press| {
         json!({
             "node": press.node.to_string(), "incarnation": press.incarnation.0, "number": press.number,

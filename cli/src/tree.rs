@@ -82,6 +82,7 @@ fn line_json(line: &TreeLine) -> Value {
         "place": line.place,
         "waiting": line.waiting,
         "waiting_most": line.waiting_most,
+        "oldest_us": line.oldest_us,
         "strategy": line.strategy,
     })
 }
@@ -111,6 +112,7 @@ mod tests {
             place: Some(format!("thread {name}, SCHED_FIFO 40, CPU 3")),
             waiting: Some(12),
             waiting_most: Some(512),
+            oldest_us: None,
             strategy: Some("one for one".to_owned()),
         };
         let report = TreeReport { name: name.clone(), lines: [0, 1, 9].map(line).to_vec(), left_out: 0 };

@@ -3,8 +3,8 @@
 //!
 //! The processes share the monotonic clock of the machine, so one clock measures the time from the last command, or
 //! from the order to stop, to a safe output. The times are upper bounds: the last command before a kill or a pause was
-//! sent up to one period earlier, and that period is added. Commands that arrive late are injected in the tests of the
-//! guard.
+//! sent up to one period earlier, and that period is added. Commands become late when the echoes that they quote do: the
+//! time counts from the first echo that is held back.
 
 mod node;
 mod report;
@@ -21,6 +21,8 @@ use system::System;
 
 /// The names of the nodes. The first one commands the outputs of the others.
 pub const NODES: [&str; 3] = ["central", "left", "right"];
+/// Those with an output.
+const DRIVES: [&str; 2] = [NODES[1], NODES[2]];
 /// Time that the contracts allow for late threads: a test machine has many processes and few processors.
 pub const SLACK: Duration = Duration::from_millis(30);
 /// The time of the contracts.
@@ -42,6 +44,8 @@ enum Injection {
     Kill,
     /// The process of the sender is paused.
     Pause,
+    /// The echoes to the sender are held back, so that its commands are late.
+    Delay,
     /// The node of the sender stops in order.
     Leave,
     /// The stop of the whole system is pressed.
@@ -49,7 +53,7 @@ enum Injection {
 }
 
 impl Injection {
-    const ALL: [Self; 4] = [Self::Kill, Self::Pause, Self::Leave, Self::Press];
+    const ALL: [Self; 5] = [Self::Kill, Self::Pause, Self::Delay, Self::Leave, Self::Press];
 
     const fn of_round(round: u32) -> Self {
         Self::ALL[round as usize % Self::ALL.len()]
@@ -60,8 +64,8 @@ impl Injection {
         match self {
             // With the last command.
             Self::Kill | Self::Pause => PERIOD,
-            // Commands are sent until the order is executed.
-            Self::Leave | Self::Press => Duration::ZERO,
+            // Good commands are sent later, too: until the order is executed, or the newest echo is too old.
+            Self::Delay | Self::Leave | Self::Press => Duration::ZERO,
         }
     }
 }
@@ -89,11 +93,12 @@ fn play(system: &mut System, injection: Injection, report: &mut Report) {
     match injection {
         Injection::Kill => system.kill_central(),
         Injection::Pause => system.pause_central(),
+        Injection::Delay => system.delay_central(),
         Injection::Leave => system.order_central_to_leave(),
         Injection::Press => system.press(PRESS_WITHIN),
     }
     report.rounds += 1;
-    for node in &NODES[1..] {
+    for (drive, node) in DRIVES.into_iter().enumerate() {
         let safe_ns = system.wait_until_safe(node);
         // An output that a late command had made safe before has no such time.
         if let Some(took) = safe_ns.checked_sub(began.as_nanos()) {
@@ -101,12 +106,13 @@ fn play(system: &mut System, injection: Injection, report: &mut Report) {
             report.claim(took <= WITHIN, || {
                 format!("{node} was safe {took:?} after {injection:?}, not within {WITHIN:?}")
             });
-            report.times[injection as usize].note(took);
+            report.times[injection as usize][drive].note(took);
         }
     }
     match injection {
         Injection::Kill | Injection::Leave => system.start_central(),
         Injection::Pause => system.resume_central(),
+        Injection::Delay => system.end_delay(),
         Injection::Press => system.release(),
     }
 }

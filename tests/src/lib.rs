@@ -3,6 +3,7 @@
 
 pub mod attacks;
 pub mod barriers;
+pub mod careless;
 pub mod clients;
 pub mod contracts;
 pub mod link_faults;

@@ -9,6 +9,7 @@ import { readFileSync } from "node:fs";
 import { join } from "node:path";
 import { parseArgs } from "node:util";
 
+import { latenessOfEach, now } from "./lateness.mjs";
 import { STEP_MS, onStage, until } from "./robot.mjs";
 
 const PAGES = [0, 1, 5];
@@ -56,7 +57,7 @@ async function walk(pages) {
     const file = join(stage.folder, "report.json");
     const robot = await stage.startRobot(["--strides", `${strides}`, "--report", file]);
     const view = await stage.startView();
-    const began = Date.now();
+    const [began, from] = [Date.now(), now()];
     for (let page = 0; page < pages; page += 1) await openPage(stage, view.address);
     await until("the end of the walk", () => robot.exitCode !== null, STEP_MS + strides * STRIDE_MS);
     const viewPercent = (100_000 * cpuSeconds(view.child.pid)) / (Date.now() - began);
@@ -64,8 +65,9 @@ async function walk(pages) {
     const { verdict, real_time: found } = JSON.parse(readFileSync(file, "utf8"));
     const late = ({ p50, p99, p999, max }) => `${p50} / ${p99} / ${p999} / ${max}`;
     const each = Object.entries(found.cpu_percent).map(([name, share]) => `${name} ${share.toFixed(0)}`);
+    const ofEach = latenessOfEach(stage.walk, from, now()).map(([name, { p50, p99, max }]) => `${name} ${p50} / ${p99} / ${max}`);
     cells = [
-      pages, late(found.drives.lateness_us), late(found.central_late_us), late(found.plant_late_us), found.drives.deadline_misses,
+      pages, late(found.drives.lateness_us), late(found.central_late_us), late(found.plant_late_us), ofEach.join(", "), found.drives.deadline_misses,
       `${found.cpu_percent_total.toFixed(0)} (${each.join(", ")})`, viewPercent.toFixed(1),
       found.host.others_cpu_percent?.toFixed(0) ?? "?", found.host.stalls.length, verdict,
     ];
@@ -74,7 +76,7 @@ async function walk(pages) {
 }
 
 const HEADING = [
-  "pages", "drives late, us: p50 / p99 / p99.9 / max", "central late, us", "plant late, us", "ticks over 2 ms late",
+  "pages", "drives late, us: p50 / p99 / p99.9 / max", "central late, us", "plant late, us", "each loop late, us: p50 / p99 / max", "ticks over 2 ms late",
   "CPU of the robot, % of one", "CPU of sinew view, % of one", "all other programs, % of all CPUs", "stalls of the host", "verdict",
 ];
 const rows = [];

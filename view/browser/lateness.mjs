@@ -40,6 +40,11 @@ export function lateness(walk, from, to) {
   return { drives: figures(drives), central: figures(central), assisting };
 }
 
+/** Returns the lateness of each loop, us, by its node. */
+export function latenessOfEach(walk, from, to) {
+  return [...DRIVES, "central"].map((name) => [name, figures([...rows(walk, name, from, to)])]);
+}
+
 /** Returns the lateness as text. */
 export function inWords({ drives, central, assisting }) {
   const each = ({ p50, p99, max }) => `${p50} / ${p99} / ${max} us`;

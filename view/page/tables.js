@@ -19,8 +19,9 @@ function facts(node) {
     ["Security", report.is_open === null ? "-" : report.is_open ? "open" : "keys"],
   ];
   if (report.real_time) {
-    const { granted, wanted, max_us } = report.real_time;
-    lines.push(["Real time", `priority ${granted} of ${wanted}, at most ${short(max_us)} µs late`]);
+    const { granted, wanted, max_us, refusals, memory } = report.real_time;
+    const why = granted < wanted ? ` (refused: ${refusals.join("; ") || "no reason given"})` : "";
+    lines.push(["Real time", `priority ${granted} of ${wanted}${why}, memory ${memory}, at most ${short(max_us)} µs late`]);
   }
   const recording = report.recording;
   if (recording) {
@@ -88,7 +89,7 @@ function appRow(app) {
     word,
     app.state,
     app.restarts === null ? "-" : `${app.restarts}`,
-    app.waiting === null ? "-" : `${app.waiting} (most ${app.waiting_most ?? "-"})`,
+    app.waiting === null ? "-" : `${app.waiting} (most ${app.waiting_most ?? "-"}${app.oldest_ms === null ? "" : `, oldest ${short(app.oldest_ms)} ms`})`,
     app.place,
     app.ended ?? app.last_reason ?? "",
   ];

@@ -84,7 +84,7 @@ fn report(node: &NodeReport, labels: &NodeLabels) -> Value {
         "stalls": node.own_stalls.map(|stalls| stalls.count),
         "real_time": node.real_time.as_ref().map(|found| json!({
             "granted": found.granted, "wanted": found.wanted, "max_us": found.max_ns as f64 / 1e3,
-            "refusals": found.refusals,
+            "refusals": found.refusals, "memory": found.memory,
         })),
         "recording": node.recording.as_ref().map(|found| json!({
             "is_configured": found.is_configured, "programs": found.programs,
@@ -134,6 +134,7 @@ fn app(app: &AppReport, line: Option<&TreeLine>, label: &str) -> Value {
         "last_reason": line.and_then(|line| line.last_reason.as_ref()),
         "place": line.and_then(|line| line.place.as_ref()),
         "waiting": line.and_then(|line| line.waiting), "waiting_most": line.and_then(|line| line.waiting_most),
+        "oldest_ms": line.and_then(|line| line.oldest_us).map(|micros| micros as f64 / 1e3),
     })
 }
 

@@ -115,6 +115,8 @@ pub struct MailboxState {
     pub depth: usize,
     /// Maximum number that ever waited at once.
     pub high_water: usize,
+    /// Age of the oldest one; `None`: none waits, or its age is unknown.
+    pub oldest: Option<Duration>,
 }
 
 /// The settings and the children of a supervisor.
@@ -263,8 +265,11 @@ impl Root {
             restarts: view.restarts,
             last_reason: view.last_reason.map(|reason| supervisor.name_children(reason)),
             place,
-            mailbox: mailbox
-                .map(|mailbox| MailboxState { depth: mailbox.depth(), high_water: mailbox.high_water() }),
+            mailbox: mailbox.map(|mailbox| MailboxState {
+                depth: mailbox.depth(),
+                high_water: mailbox.high_water(),
+                oldest: mailbox.oldest(),
+            }),
             missing,
             abandoned: view.abandoned,
             supervises: below.map(|below| self.supervises(supervisor, now, below)),
@@ -337,7 +342,7 @@ impl fmt::Display for Supervised {
         if let Some(place) = &self.place {
             write!(f, ", on {place}")?;
         }
-        if let Some(MailboxState { depth, high_water }) = self.mailbox {
+        if let Some(MailboxState { depth, high_water, .. }) = self.mailbox {
             write!(f, ", mailbox {depth} (at most {high_water})")?;
         }
         for Absence { name, why, .. } in &self.missing {

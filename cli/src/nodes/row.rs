@@ -2,10 +2,13 @@
 
 use serde_json::{Value, json};
 use sinew::inspect::{
-    IdleReport, LinkReport, NodeReport, PeerReport, RouteReport, StallReport, TroubleReport,
+    IdleReport, LinkReport, NodeReport, PeerReport, RetainedReport, RouteReport, StallReport, TroubleReport,
 };
 
-use super::{COLUMNS, real_time};
+use super::{
+    COLUMNS, real_time,
+    stop::{self, Stop},
+};
 use crate::{
     security,
     system::Answer,
@@ -99,7 +102,7 @@ impl<'a> Row<'a> {
         })
     }
 
-    pub(super) fn cells(&self) -> [String; COLUMNS] {
+    pub(super) fn cells(&self, stop: Option<&Stop>) -> [String; COLUMNS] {
         let report = self.answer.result.as_ref().ok();
         [
             self.answer.node.to_string(),
@@ -107,6 +110,7 @@ impl<'a> Row<'a> {
             or_dash(self.incarnation().map(|number| number.to_string())),
             or_dash(report.map(|report| time(report.up_us))),
             self.state().to_owned(),
+            stop::cell(stop, self.answer.node, report.and_then(|report| report.stop)),
             or_dash(report.map(security::cell)),
             self.found_by(),
             self.links(),
@@ -135,6 +139,8 @@ impl<'a> Row<'a> {
             "refused": result.ok().map(|report| report.refused),
             "own_stalls": result.ok().and_then(|report| report.own_stalls).map(|stalls| stalls_json(&stalls)),
             "real_time": result.ok().and_then(|report| report.real_time.as_ref()).map(real_time::json),
+            "stop": result.ok().and_then(|report| report.stop).map(|state| crate::stop::state(Some(state))),
+            "retained": result.ok().and_then(|report| report.retained).map(|retained| retained_json(&retained)),
             "found_us": seen.and_then(|seen| seen.found_us),
             "found_by": seen.map(|seen| &seen.found_by),
             "silent_us": seen.and_then(|seen| seen.silent_us),
@@ -180,6 +186,11 @@ fn trouble_json(of: &TroubleReport) -> Value {
 fn idle_json(of: &IdleReport) -> Value {
     let IdleReport { app, name, since_us } = of;
     json!({ "app": app.to_string(), "name": name, "since_us": since_us })
+}
+
+fn retained_json(of: &RetainedReport) -> Value {
+    let RetainedReport { values, bytes, not_kept, not_handed_over } = of;
+    json!({ "values": values, "bytes": bytes, "not_kept": not_kept, "not_handed_over": not_handed_over })
 }
 
 fn stalls_json(of: &StallReport) -> Value {

@@ -30,6 +30,8 @@ const NODES: &[Column] = &[
     ("LATE MAX", "late_max_us"),
     ("STALLS", "stalls"),
     ("LONGEST", "stall_longest_us"),
+    ("RETAINED", "retained_values"),
+    ("NOT RETAINED", "retained_dropped"),
 ];
 const APPS: &[Column] = &[
     ("APPLICATION", "name"),
@@ -39,6 +41,7 @@ const APPS: &[Column] = &[
     ("DIRECT OUT/S", "direct_out_per_s"),
     ("WAITING", "waiting"),
     ("MOST", "waiting_most"),
+    ("OLDEST", "oldest_us"),
     ("RESTARTS", "restarts"),
     ("GUARD", "guard"),
 ];
@@ -249,7 +252,7 @@ fn node_row(node: &NodeAnswers) -> Row {
     } else {
         ("up", true)
     };
-    let measured = report.real_time.as_ref();
+    let (measured, retained) = (report.real_time.as_ref(), report.retained);
     let cells = vec![
         name,
         address,
@@ -261,6 +264,8 @@ fn node_row(node: &NodeAnswers) -> Row {
         Cell::time(measured.map(|found| found.max_ns / 1_000)),
         Cell::count(report.own_stalls.map(|stalls| stalls.count)),
         Cell::time(report.own_stalls.filter(|stalls| stalls.count > 0).map(|stalls| stalls.longest_us)),
+        Cell::count(retained.map(|of| of.values)),
+        Cell::count(retained.map(|of| of.not_kept.saturating_add(of.not_handed_over))),
     ];
     // A node of an older version does not know the stop.
     let is_released = report.stop.is_none_or(|state| state == StopState::Released);
@@ -295,6 +300,7 @@ fn app_row(pair: &Pair<'_>, app: &AppReport) -> Row {
         if has_direct { pair.rate(direct_out) } else { Cell::Unknown },
         Cell::Count(waiting),
         Cell::count(line.and_then(|line| line.waiting_most)),
+        Cell::time(line.and_then(|line| line.oldest_us)),
         Cell::count(line.map(|line| line.restarts)),
         guard,
     ];

@@ -66,7 +66,7 @@ fn missing_contract_is_named_with_its_declaration() {
     assert_eq!(json["missing"][0]["conditions"], serde_json::json!(["lost", "late", "stopped"]), "{json}");
     let answer = scenario.sinew("central", &["contracts", "--wide"]);
     assert_eq!(answer.code, Some(1), "{}{}", answer.out, answer.err);
-    assert!(answer.out.contains("drive.left obeys control by contracts.torque"), "{}", answer.out);
+    assert!(answer.out.contains("drive.left obeys control by careless.torque"), "{}", answer.out);
     assert!(answer.out.contains("Contract::when_lost(\"control\")"), "{}", answer.out);
 }
 
@@ -80,7 +80,7 @@ fn times_that_do_not_add_up_are_named() {
     });
     let answer = scenario.sinew("central", &["contracts", "--wide"]);
     assert_eq!(answer.code, Some(1), "{}{}", answer.out, answer.err);
-    let sum = "160.0 ms age_max of contracts.torque + 60.0 ms within of contracts.torque + 1000.0 ms contracts.slack_ms = 1220.0 ms, more than 1219.0 ms";
+    let sum = "160.0 ms age_max of careless.torque + 60.0 ms within of careless.torque + 1000.0 ms contracts.slack_ms = 1220.0 ms, more than 1219.0 ms";
     assert!(answer.out.contains(sum), "{}", answer.out);
     assert!(answer.out.contains("does not close"), "{}", answer.out);
 }

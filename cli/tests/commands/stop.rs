@@ -27,6 +27,15 @@ fn press_is_confirmed_shown_and_released() {
     let answer = scenario.sinew("knee", &["stop", "status"]);
     assert_eq!(answer.code, Some(1), "{}{}", answer.out, answer.err);
     assert!(answer.out.contains("the person stumbles"), "{}", answer.out);
+    // And: the list of the nodes begins with it
+    scenario.until("it has both confirmations", "knee", &["nodes"], |json| {
+        let nodes = json["stop"]["nodes"].as_array();
+        nodes.is_some_and(|nodes| nodes.iter().all(|node| node["confirmed_us"].is_u64()))
+    });
+    let answer = scenario.sinew("knee", &["nodes"]);
+    assert_eq!(answer.code, Some(1), "{}{}", answer.out, answer.err);
+    assert!(answer.out.starts_with("STOPPED: pressed at node "), "{}", answer.out);
+    assert!(answer.out.contains("2 of 2 nodes have confirmed; `sinew stop status`"), "{}", answer.out);
     // And: it is released there
     let answer = scenario.sinew("knee", &["stop", "release", "--within-ms", "20000"]);
     assert_eq!(answer.code, Some(0), "{}{}", answer.out, answer.err);
@@ -50,6 +59,12 @@ fn paused_node_is_named_and_comes_up_stopped() {
         ["hip", "knee"].map(|name| named(&json["nodes"], name).expect("it is named").clone());
     assert!(hip["confirmed_us"].is_u64() && knee_row["confirmed_us"].is_null(), "{json}");
     assert_eq!(knee_row["bound_us"], 0, "no application guards an output there: {json}");
+    // And: the list of the nodes names it, too
+    let nodes = scenario.sinew("hip", &["nodes"]).out;
+    assert!(nodes.contains("1 of 2 nodes have confirmed; NOT CONFIRMED: knee; "), "{nodes}");
+    let json = scenario.sinew("hip", &["nodes", "--json"]).json();
+    let knee_row = named(&json["stop"]["nodes"], "knee").expect("it is named");
+    assert!(json["stop"]["state"] == "stopped" && knee_row["confirmed_us"].is_null(), "{json}");
     // When: it runs again
     knee.signal(Signal::CONT);
     // Then

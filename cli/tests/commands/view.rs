@@ -3,7 +3,7 @@
 use std::{
     collections::BTreeMap,
     io::{Read as _, Write as _},
-    net::{Shutdown, SocketAddr, TcpStream},
+    net::{Shutdown, SocketAddr, TcpListener, TcpStream},
     process::{Command, Stdio},
     time::Duration,
 };
@@ -324,4 +324,40 @@ fn scrape_passes_the_linter_of_prometheus() {
     let rules = concat!(env!("CARGO_MANIFEST_DIR"), "/../view/alerts.yml");
     let answer = Answer::of(Command::new("promtool").args(["check", "rules", rules]));
     assert_eq!(answer.code, Some(0), "{}{}", answer.out, answer.err);
+}
+
+#[test]
+fn prometheus_scrapes_the_state_of_a_node() {
+    if Command::new("prometheus").arg("--version").output().is_err() {
+        println!("skipped: there is no prometheus (Debian: package prometheus)");
+        return;
+    }
+    // Given
+    let scenario = Scenario::new();
+    let _hip = scenario.start("hip", 1, &[]);
+    let view = View::of(&scenario, "hip");
+    let config = format!(
+        "global:\n  scrape_interval: 1s\nscrape_configs:\n  - job_name: sinew\n    static_configs:\n      - targets: ['{}']\n",
+        view.address
+    );
+    let file = scenario.directory.write("prometheus.yml", &config);
+    let free = TcpListener::bind("127.0.0.1:0").and_then(|listener| listener.local_addr());
+    let address = free.expect("a free port on loopback");
+    // When
+    let mut command = Command::new("prometheus");
+    command.arg(format!("--config.file={}", file.display()));
+    command.arg(format!("--storage.tsdb.path={}", scenario.directory.join("tsdb").display()));
+    command.arg(format!("--web.listen-address={address}")).stderr(Stdio::null());
+    let _prometheus = NodeProcess::start("prometheus", command);
+    // Then
+    until("Prometheus has the state of the hip", || {
+        let mut stream = TcpStream::connect_timeout(&address, DEADLINE).ok()?;
+        stream.set_read_timeout(Some(DEADLINE)).expect("a valid time");
+        stream.write_all(b"GET /api/v1/query?query=sinew_node_up HTTP/1.0\r\n\r\n").ok()?;
+        let mut answer = String::new();
+        stream.read_to_string(&mut answer).ok()?;
+        let found: Value = serde_json::from_str(answer.split_once("\r\n\r\n")?.1).ok()?;
+        let is_up = |one: &Value| one["metric"]["node"] == "hip" && one["value"][1] == "1";
+        found["data"]["result"].as_array()?.iter().any(is_up).then_some(())
+    });
 }

@@ -22,6 +22,7 @@ use std::{
     collections::VecDeque,
     sync::{Arc, Mutex, OnceLock, atomic::AtomicBool},
     task::Waker,
+    time::Duration,
 };
 
 pub use about::About;
@@ -359,6 +360,13 @@ impl Mailbox {
     #[must_use]
     pub fn high_water(&self) -> usize {
         lock(&self.shared).high_water
+    }
+
+    /// Returns the age of the oldest queued message; `None`: none is queued, or its age is unknown.
+    #[must_use]
+    pub fn oldest(&self) -> Option<Duration> {
+        let now = self.clock.now();
+        lock(&self.shared).queue.oldest(now)
     }
 
     /// Returns the results of the messages of `class`, and the number that is queued, being handled or in

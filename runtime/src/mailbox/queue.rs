@@ -3,7 +3,7 @@
 #[cfg(test)]
 mod tests;
 
-use std::{collections::VecDeque, sync::Arc, task::Waker};
+use std::{collections::VecDeque, sync::Arc, task::Waker, time::Duration};
 
 use super::{
     About, Budget,
@@ -343,6 +343,14 @@ impl ClassQueue {
     /// Returns the queued messages, most urgent class first.
     pub fn iter(&self) -> impl Iterator<Item = &Message> {
         self.ends.iter().chain(self.lanes.iter().flatten())
+    }
+
+    /// Returns the greatest age of the messages that are first in their lanes: a lane keeps the order of arrival. An
+    /// event of a layer has no age.
+    pub(super) fn oldest(&self, now: Time) -> Option<Duration> {
+        let first = self.lanes.iter().filter_map(VecDeque::front);
+        let sent = first.filter(|message| About::of(&message.header).is_none());
+        sent.filter_map(|message| message.header.age(now)).max()
     }
 
     /// Returns the number of queued messages.

@@ -184,3 +184,24 @@ fn closed_mailbox_rejects_waiting_and_new_messages() {
     let tally = mailbox.tally(Class::Control);
     assert_eq!((tally.taken, tally.rejected, tally.refused, tally.open()), (1, 1, 1, 0));
 }
+
+#[test]
+fn age_of_the_oldest_message_is_known() {
+    let mailbox = Mailbox::new(8);
+    assert_eq!(mailbox.oldest(), None);
+    // Given: a message that was sent five seconds ago, another one, and one of another class
+    let now = Time::now();
+    for (seconds, class) in [(5, Class::Control), (1, Class::Control), (3, Class::Bulk)] {
+        let mut sent = message();
+        (sent.header.sent, sent.header.class) = (now - Duration::from_secs(seconds), class);
+        mailbox.submit(sent).unwrap();
+    }
+    let mut reader = mailbox.attach();
+    for seconds in [5, 3] {
+        assert!(mailbox.oldest().is_some_and(|age| age >= Duration::from_secs(seconds)));
+        assert!(matches!(take(&mut reader), Poll::Ready(Some(_))));
+        reader.finish(Outcome::Delivered);
+    }
+    // Then: the newer ones remain
+    assert!(mailbox.oldest().is_some_and(|age| age >= Duration::from_secs(3)));
+}

@@ -1,20 +1,11 @@
 //! The role of a node: `central` sends commands, the others obey them with a guarded output and a contract.
 
-use std::{
-    io::BufRead,
-    net::SocketAddrV4,
-    path::PathBuf,
-    sync::{
-        Arc, Mutex, PoisonError,
-        atomic::{AtomicU64, Ordering},
-    },
-};
+use std::{io::BufRead, net::SocketAddrV4, path::PathBuf, sync::Arc};
 
 use sinew::{
     contracts::{AskContracts, Closure, Contract, ContractsReport},
     message::Sender,
     prelude::*,
-    protection::{Guard, Protection, State},
     stop::{ReleaseStop, StopReport},
 };
 use sinew_testkit::{
@@ -23,94 +14,28 @@ use sinew_testkit::{
 };
 
 use super::NODES;
+use crate::careless::{Drive, Output, commander, drive};
 
 /// Time from one command to the next.
-pub const PERIOD: Duration = Duration::from_millis(20);
+pub const PERIOD: Duration = Duration::from_millis(PERIOD_MS);
+const PERIOD_MS: u64 = 20;
 /// Age of the newest command from which its sender is late: that of the oldest one that an output accepts.
 const LATE: Duration = Duration::from_millis(160);
 /// Time from the last command to a safe output: 160 ms of age, and 60 ms of silence. The contracts add the slack.
 pub const WATCHDOG: Duration = Duration::from_millis(220);
-const CONTROL: AppAddress = AppAddress::new(0x1001);
 /// How long a release waits for the other nodes.
 const RELEASED_WITHIN_MS: u32 = 10_000;
 
-/// A protected command.
-#[derive(serde::Serialize, serde::Deserialize)]
-struct Torque {
-    newton_metres: f32,
-}
-
-impl Payload for Torque {
-    const NAME: &'static str = "contracts.torque";
-    const PROTECTION: Option<Protection> = Some(Protection::of_period(PERIOD));
-}
-
-/// Commands the outputs of the other nodes.
-struct Control;
-
-impl Actor for Control {
-    type Context = AppContext<Self>;
-
-    fn started(&mut self, context: &mut Self::Context) {
-        context.every(PERIOD, |_, _, context| {
-            for node in &NODES[1..] {
-                // A drive that is not there gets none.
-                let _ = context.send(&*format!("drive.{node}"), &Torque { newton_metres: 1.0 });
-            }
-        });
-    }
-}
-
-/// The output, as the orders of the scenario see it.
-#[derive(Default)]
-struct View {
-    guard: Mutex<Option<Guard<()>>>,
-    safe_ns: AtomicU64,
-}
-
-impl View {
-    fn line(&self) -> String {
-        let guard = self.guard.lock().unwrap_or_else(PoisonError::into_inner);
-        let is_live = guard.as_ref().is_some_and(|guard| guard.state() == State::Live);
-        format!("{} {}", u8::from(is_live), self.safe_ns.load(Ordering::SeqCst))
-    }
-}
-
-struct Drive {
-    control: Tid,
-    view: Arc<View>,
-}
-
-impl Actor for Drive {
-    type Context = AppContext<Self>;
-
-    fn started(&mut self, context: &mut Self::Context) {
-        let view = self.view.clone();
-        let make_safe = move |(): &mut (), _| view.safe_ns.store(Time::now().as_nanos(), Ordering::SeqCst);
-        let guard = context.guard::<Torque, _>(self.control, (), make_safe).expect("there is the thread");
-        *self.view.guard.lock().unwrap_or_else(PoisonError::into_inner) = Some(guard.clone());
-        context.every(PERIOD, move |_, _, _| {
-            // A careless application: it acknowledges and arms whenever that is possible.
-            let _ = guard.acknowledge_stop();
-            let _ = guard.arm();
-        });
-    }
-}
-
-impl Handler<Delivery<Torque>> for Drive {
-    type Result = ();
-
-    fn handle(&mut self, _: Delivery<Torque>, _: &mut Self::Context) {}
-}
-
-/// `NUMBER GROUP PROJECT FOLDER SLACK_MS PLANT`. With the plant `missing` a drive declares no contract, with `short`
-/// one of too short a time, with `none` a correct one.
+/// `NUMBER GROUP PROJECT FOLDER SLACK_MS PLANT [ANNOUNCE]`. With the plant `missing` a drive declares no contract, with
+/// `short` one of too short a time, with `none` a correct one. The last argument is the address for the other nodes.
 pub(crate) fn run(arguments: &[String]) {
-    let [number, group, project, folder, slack, plant] = arguments else {
-        panic!("six arguments, not {arguments:?}")
+    let [number, group, project, folder, slack, plant, announce @ ..] = arguments else {
+        panic!("six arguments and more, not {arguments:?}")
     };
     let number: u8 = number.parse().expect("the scenario counts");
     let group: SocketAddrV4 = group.parse().expect("the scenario's group");
+    let announce: Option<SocketAddrV4> =
+        announce.first().map(|address| address.parse().expect("an address of the scenario's network"));
     let name = NODES[usize::from(number)];
     let slack = Duration::from_millis(slack.parse().expect("milliseconds"));
     let project = format!("contracts-{project}");
@@ -121,25 +46,33 @@ pub(crate) fn run(arguments: &[String]) {
         (config.ndl.multicast, config.ndl.mdns_port) = (Some(group), None);
         config.ndl.period = Duration::from_millis(100);
         config.rt.probe = Duration::ZERO;
+        config.gncl.announce = announce;
         (config.contracts.dry_run, config.contracts.slack) = (true, slack);
     });
     let (operator, key) = sender_app(&format!("operator.{name}"));
-    let view = Arc::new(View::default());
+    let output = Arc::<Output>::default();
+    output.set_acknowledges(true);
     let builder = builder.app(operator);
     let builder = if number == 0 {
-        builder.app(AppSpec::new("control", || Control).address(CONTROL).own_thread())
+        let drives = NODES[1..].iter().map(|node| format!("drive.{node}"));
+        builder.app(commander::<PERIOD_MS>(PERIOD, drives).own_thread())
     } else {
-        builder.app(drive(name, &view, WATCHDOG + slack, plant))
+        builder.app(drive_with_contract(name, &output, WATCHDOG + slack, plant))
     };
     let node = builder.start().unwrap_or_else(|error| panic!("{error}"));
     node.handle().wait_until_running(DEADLINE).expect("it requires nothing");
-    execute_orders(&key.sender(), node.handle().address(), &view);
+    println!("up {}", node.handle().gncl_address().expect("its layers are ready"));
+    execute_orders(&key.sender(), node.handle().address(), &output);
     node.stop();
 }
 
-fn drive(name: &str, view: &Arc<View>, within: Duration, plant: &str) -> AppSpec<Drive> {
-    let (shared, control) = (view.clone(), Tid::new([127, 0, 0, 1].into(), CONTROL));
-    let drive = AppSpec::new(format!("drive.{name}"), move || Drive { control, view: shared.clone() });
+fn drive_with_contract(
+    name: &str,
+    output: &Arc<Output>,
+    within: Duration,
+    plant: &str,
+) -> AppSpec<Drive<PERIOD_MS>> {
+    let drive = drive(format!("drive.{name}"), ([127, 0, 0, 1].into(), PERIOD), output).own_thread();
     let within = match plant {
         "missing" => None,
         "short" => Some(within - Duration::from_millis(1)),
@@ -147,7 +80,6 @@ fn drive(name: &str, view: &Arc<View>, within: Duration, plant: &str) -> AppSpec
         other => panic!("{other:?} is no plant"),
     };
     let contract = |within| Contract::when_lost("control").or_late(LATE).or_stopped().goes_to("safe", within);
-    let drive = drive.handles::<Torque>().own_thread();
     match within {
         Some(within) => drive.contract(contract(within)),
         None => drive,
@@ -155,12 +87,11 @@ fn drive(name: &str, view: &Arc<View>, within: Duration, plant: &str) -> AppSpec
 }
 
 /// Executes the orders of the scenario, and prints one line for each.
-fn execute_orders(operator: &Sender, own: NodeAddress, view: &View) {
-    println!("up");
+fn execute_orders(operator: &Sender, own: NodeAddress, output: &Output) {
     for line in std::io::stdin().lock().lines().map_while(Result::ok) {
         let words: Vec<&str> = line.split(' ').collect();
         match words[..] {
-            ["output"] => println!("{}", view.line()),
+            ["output"] => println!("{} {}", u8::from(output.is_live()), output.safe_ns()),
             ["press", within_ms] => {
                 let within = Duration::from_millis(within_ms.parse().expect("milliseconds"));
                 let report = wait(operator.press_stop("the scenario", within).expect("there is room"));

@@ -1,9 +1,13 @@
 //! The three nodes, each in a process of its own, and the orders to them.
 
-use std::{process::Stdio, time::Duration};
+use std::{net::SocketAddr, process::Stdio, time::Duration};
 
 use rustix::process::Signal;
-use sinew_testkit::{NodeProcess, TestDirectory, numbers, own_group, unique, until};
+use sinew_testkit::{
+    NodeProcess, TestDirectory,
+    network::{FaultyNetwork, Listener, Side},
+    numbers, own_group, unique, until,
+};
 
 use super::{NODES, SLACK};
 use crate::role;
@@ -16,22 +20,35 @@ pub(super) struct System {
     directory: TestDirectory,
     /// The arguments of all nodes: the group, and the number of the project.
     shared: [String; 2],
+    /// The connections between the nodes: `central` is on the left.
+    network: FaultyNetwork,
     nodes: Vec<NodeProcess>,
 }
 
 impl System {
     pub(super) fn start() -> Self {
         let shared = [own_group().to_string(), unique().to_string()];
-        let mut system = Self { directory: TestDirectory::new(), shared, nodes: Vec::new() };
+        let listen = SocketAddr::from(([127, 0, 0, 1], 0));
+        let sides = [Side::Left, Side::Right, Side::Right];
+        let listeners = sides.map(|side| Listener { side, listen, datagrams: false });
+        let network = FaultyNetwork::start(&listeners, 1).expect("ports on loopback");
+        let mut system = Self { directory: TestDirectory::new(), shared, network, nodes: Vec::new() };
         system.nodes = (0..NODES.len()).map(|node| system.process(node)).collect();
-        system.nodes.iter_mut().for_each(|node| drop(node.wait_for(&["up"])));
+        (0..NODES.len()).for_each(|node| system.connect(node));
         system
+    }
+
+    /// Waits until a node is up, and leads its connections to it.
+    fn connect(&mut self, node: usize) {
+        let line = self.nodes[node].wait_for(&["up"]);
+        let address = line.trim_end().strip_prefix("up ").and_then(|address| address.parse().ok());
+        self.network.set_destination(node, address.unwrap_or_else(|| panic!("{line:?}")));
     }
 
     fn process(&self, node: usize) -> NodeProcess {
         let mut command = role("contract-node");
         command.arg(node.to_string()).args(&self.shared).arg(self.directory.join(""));
-        command.arg(SLACK.as_millis().to_string()).arg("none");
+        command.arg(SLACK.as_millis().to_string()).arg("none").arg(self.network.address(node).to_string());
         // Each loss is a warning.
         command.stderr(Stdio::null());
         NodeProcess::start(NODES[node], command)
@@ -69,6 +86,8 @@ impl System {
     }
 
     pub(super) fn kill_central(&mut self) {
+        // As on a host of its own: nothing listens in its place.
+        self.network.refuse(true);
         self.nodes[0].kill();
     }
 
@@ -80,6 +99,15 @@ impl System {
         self.nodes[0].signal(Signal::CONT);
     }
 
+    /// Holds back what the drives send to `central`. Its commands quote older and older echoes: they become late.
+    pub(super) fn delay_central(&self) {
+        self.network.change(Side::Left, |faults| faults.parted = true);
+    }
+
+    pub(super) fn end_delay(&self) {
+        self.network.change(Side::Left, |faults| faults.parted = false);
+    }
+
     pub(super) fn order_central_to_leave(&mut self) {
         self.nodes[0].send_line("leave");
     }
@@ -88,7 +116,8 @@ impl System {
     pub(super) fn start_central(&mut self) {
         self.nodes[0].wait_for_exit();
         self.nodes[0] = self.process(0);
-        self.nodes[0].wait_for(&["up"]);
+        self.connect(0);
+        self.network.refuse(false);
     }
 
     pub(super) fn press(&mut self, within: Duration) {

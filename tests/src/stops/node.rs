@@ -4,17 +4,13 @@ use std::{
     io::BufRead,
     net::{Ipv4Addr, SocketAddrV4},
     path::PathBuf,
-    sync::{
-        Arc, Mutex, PoisonError,
-        atomic::{AtomicBool, AtomicU64, Ordering},
-    },
+    sync::Arc,
 };
 
 use serde_json::json;
 use sinew::{
     message::{AskError, Sender},
     prelude::*,
-    protection::{Guard, Protection, State},
     stop::{AskStop, ReleaseStop, StopReport, StopState},
 };
 use sinew_testkit::{
@@ -23,99 +19,19 @@ use sinew_testkit::{
 };
 
 use super::NODES;
+use crate::careless::{Output, commander, drive};
 
-const PERIOD: Duration = Duration::from_millis(20);
-const CONTROL: AppAddress = AppAddress::new(0x1001);
+const PERIOD_MS: u64 = 20;
+const PERIOD: Duration = Duration::from_millis(PERIOD_MS);
 /// Bytes of a message of the load.
 const FILLER: usize = 256;
 /// How long a release waits for the other nodes.
 const RELEASED_WITHIN_MS: u32 = 10_000;
 
-/// A protected command.
-#[derive(serde::Serialize, serde::Deserialize)]
-struct Torque {
-    newton_metres: f32,
-}
-
-impl Payload for Torque {
-    const NAME: &'static str = "stops.torque";
-    const PROTECTION: Option<Protection> = Some(Protection::of_period(PERIOD));
-}
-
 payload!("stops.load", Bulk => #[derive(Debug)] struct Load {
     #[serde(with = "serde_bytes")]
     filler: Vec<u8>,
 });
-
-/// Commands the outputs of all nodes.
-struct Control;
-
-impl Actor for Control {
-    type Context = AppContext<Self>;
-
-    fn started(&mut self, context: &mut Self::Context) {
-        context.every(PERIOD, |_, _, context| {
-            for node in 0..NODES {
-                // A drive that is not there gets none.
-                let _ = context.send(&*format!("drive.{node}"), &Torque { newton_metres: 1.0 });
-            }
-        });
-    }
-}
-
-/// The output, as the orders of the scenario see it.
-#[derive(Default)]
-struct View {
-    guard: Mutex<Option<Guard<()>>>,
-    safe_ns: AtomicU64,
-    moved: AtomicU64,
-    /// The person starts again: a released stop is acknowledged.
-    starts: AtomicBool,
-}
-
-impl View {
-    fn line(&self) -> String {
-        let guard = self.guard.lock().unwrap_or_else(PoisonError::into_inner);
-        let is_live = guard.as_ref().is_some_and(|guard| guard.state() == State::Live);
-        let [safe_ns, moved] = [&self.safe_ns, &self.moved].map(|number| number.load(Ordering::SeqCst));
-        format!("{} {safe_ns} {moved}", u8::from(is_live))
-    }
-}
-
-struct Drive {
-    control: Tid,
-    view: Arc<View>,
-}
-
-impl Actor for Drive {
-    type Context = AppContext<Self>;
-
-    fn started(&mut self, context: &mut Self::Context) {
-        let view = self.view.clone();
-        let make_safe = move |(): &mut (), _| view.safe_ns.store(Time::now().as_nanos(), Ordering::SeqCst);
-        let guard = context.guard::<Torque, _>(self.control, (), make_safe).expect("there is the thread");
-        *self.view.guard.lock().unwrap_or_else(PoisonError::into_inner) = Some(guard.clone());
-        context.every(PERIOD, move |drive, _, _| {
-            if drive.view.starts.load(Ordering::SeqCst) {
-                let _ = guard.acknowledge_stop();
-            }
-            // A careless application: it arms whenever that is possible.
-            let _ = guard.arm();
-        });
-    }
-}
-
-impl Handler<Delivery<Torque>> for Drive {
-    type Result = ();
-
-    fn handle(&mut self, _: Delivery<Torque>, _: &mut Self::Context) {
-        let view = self.view.clone();
-        let guard = view.guard.lock().unwrap_or_else(PoisonError::into_inner).clone();
-        if let Some(guard) = guard {
-            let _ = guard.apply(|()| view.moved.fetch_add(1, Ordering::SeqCst));
-        }
-    }
-}
 
 /// Sends load to the next node, and takes that of the former one.
 struct Loader {
@@ -162,35 +78,36 @@ pub(crate) fn run(arguments: &[String]) {
             config.security.access = Some(access.clone());
             config.state = Some(state.clone());
         });
-    let view = Arc::new(View::default());
-    let (shared, control) = (view.clone(), Tid::new([10, 77, 0, 1].into(), CONTROL));
-    let drive = AppSpec::new(format!("drive.{number}"), move || Drive { control, view: shared.clone() });
+    let output = Arc::<Output>::default();
+    let drive = drive::<PERIOD_MS>(format!("drive.{number}"), ([10, 77, 0, 1].into(), PERIOD), &output);
     let messages = load.parse().expect("a number of messages");
     let to = format!("load.{}", (number + 1) % NODES);
     let loader = AppSpec::new(format!("load.{number}"), move || Loader { to: to.clone(), messages });
     let (operator, key) = sender_app(&format!("operator.{number}"));
-    let mut builder = builder
-        .app(drive.handles::<Torque>().own_thread())
-        .app(loader.handles::<Load>().own_thread())
-        .app(operator);
+    let mut builder =
+        builder.app(drive.own_thread()).app(loader.handles::<Load>().own_thread()).app(operator);
     if number == 0 {
-        builder = builder.app(AppSpec::new("control", || Control).address(CONTROL).own_thread());
+        let drives = (0..NODES).map(|node| format!("drive.{node}"));
+        builder = builder.app(commander::<PERIOD_MS>(PERIOD, drives).own_thread());
     }
     let node = builder.start().unwrap_or_else(|error| panic!("{error}"));
     node.handle().wait_until_running(DEADLINE).expect("it requires nothing");
-    obey(&key.sender(), node.handle().address(), &view);
+    obey(&key.sender(), node.handle().address(), &output);
     node.stop();
 }
 
 /// Executes the orders of the scenario, and prints one line for each.
-fn obey(operator: &Sender, own: NodeAddress, view: &View) {
+fn obey(operator: &Sender, own: NodeAddress, output: &Output) {
     println!("up");
     for line in std::io::stdin().lock().lines().map_while(Result::ok) {
         let words: Vec<&str> = line.split(' ').collect();
         match words[..] {
-            ["start"] => view.starts.store(true, Ordering::SeqCst),
-            ["hold"] => view.starts.store(false, Ordering::SeqCst),
-            ["output"] => println!("{}", view.line()),
+            ["start"] => output.set_acknowledges(true),
+            ["hold"] => output.set_acknowledges(false),
+            ["output"] => {
+                let (is_live, safe_ns, moved) = (output.is_live(), output.safe_ns(), output.moved());
+                println!("{} {safe_ns} {moved}", u8::from(is_live));
+            }
             ["press", within_ms] => {
                 let within = Duration::from_millis(within_ms.parse().expect("milliseconds"));
                 let pressed = Time::now();

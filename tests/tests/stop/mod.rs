@@ -2,15 +2,12 @@
 
 mod clients;
 
-use std::sync::{
-    Arc, Mutex,
-    atomic::{AtomicBool, AtomicU64, Ordering},
-};
+use std::sync::Arc;
 
 use sinew::{
     message::{AskError, Rejection, Sender},
     prelude::*,
-    protection::{ArmError, Cause, Guard, Protection, State},
+    protection::{ArmError, Cause, Guard, State},
     stop::{AskStop, PressStop, ReleaseStop, StopReport, StopState},
 };
 use sinew_testkit::{
@@ -18,117 +15,51 @@ use sinew_testkit::{
     scripted::{SenderApp, sender_app, wait},
     until,
 };
+use sinew_tests::careless::{Output, commander, drive};
 
 const PERIOD: Duration = Duration::from_millis(5);
+/// The period of the limits of a command: no machine is too slow for it.
+const PERIOD_MS: u64 = 5_000;
 const WITHIN: Duration = Duration::from_secs(20);
-const CONTROL: AppAddress = AppAddress::new(0x1001);
-
-#[derive(serde::Serialize, serde::Deserialize)]
-struct Torque {
-    newton_metres: f32,
-}
-
-impl Payload for Torque {
-    const NAME: &'static str = "test.stop.torque";
-    // No machine is too slow for it.
-    const PROTECTION: Option<Protection> = Some(Protection::of_period(Duration::from_secs(5)));
-}
-
-/// Sends commands to all drives, all the time.
-struct Control;
-
-impl Actor for Control {
-    type Context = AppContext<Self>;
-
-    fn started(&mut self, ctx: &mut Self::Context) {
-        ctx.every(PERIOD, |_, _, ctx| {
-            for number in 0..4 {
-                // A drive that is not there gets none.
-                let _ = ctx.send(&*format!("drive {number}"), &Torque { newton_metres: 1.0 });
-            }
-        });
-    }
-}
-
-/// The view of a test on a drive, and its orders.
-#[derive(Default)]
-struct View {
-    guard: Mutex<Option<Guard<()>>>,
-    /// Number of commands that reached the output.
-    moved: AtomicU64,
-    /// The person has pressed "start" again.
-    starts_again: AtomicBool,
-}
-
-impl View {
-    fn guard(&self) -> Guard<()> {
-        let guard = || self.guard.lock().expect("nobody panics with it").clone();
-        until("the drive has its guard", guard)
-    }
-
-    fn wait_until_it_moves(&self) {
-        let before = self.moved.load(Ordering::SeqCst);
-        until("the output moves", || (self.moved.load(Ordering::SeqCst) > before).then_some(()));
-    }
-}
-
-/// Arms its output whenever it can: the careless application.
-struct Drive {
-    control: Tid,
-    view: Arc<View>,
-}
-
-impl Actor for Drive {
-    type Context = AppContext<Self>;
-
-    fn started(&mut self, ctx: &mut Self::Context) {
-        let guard = ctx.guard::<Torque, _>(self.control, (), |(), _| {}).expect("there is the thread");
-        *self.view.guard.lock().expect("nobody panics with it") = Some(guard.clone());
-        ctx.every(PERIOD, move |drive, _, _| {
-            if drive.view.starts_again.load(Ordering::SeqCst) {
-                let _ = guard.acknowledge_stop();
-            }
-            let _ = guard.arm();
-        });
-    }
-}
-
-impl Handler<Delivery<Torque>> for Drive {
-    type Result = ();
-
-    fn handle(&mut self, _: Delivery<Torque>, _: &mut Self::Context) {
-        let view = self.view.clone();
-        let _ = view.guard().apply(|()| view.moved.fetch_add(1, Ordering::SeqCst));
-    }
-}
 
 /// A node with a drive, and an application that the test sends with.
 struct Robot {
     node: Node,
-    view: Arc<View>,
+    output: Arc<Output>,
     sender: Sender,
 }
 
+impl Robot {
+    fn guard(&self) -> Guard<()> {
+        until("the drive has its guard", || self.output.guard())
+    }
+
+    fn wait_until_it_moves(&self) {
+        let before = self.output.moved();
+        until("the output moves", || (self.output.moved() > before).then_some(()));
+    }
+}
+
 fn build(builder: NodeBuilder, number: usize) -> Robot {
-    let view = Arc::new(View::default());
-    let (shared, control) = (view.clone(), Tid::new([127, 0, 0, 1].into(), CONTROL));
-    let drive = AppSpec::new(format!("drive {number}"), move || Drive { control, view: shared.clone() });
+    let output = Arc::<Output>::default();
+    let drive = drive::<PERIOD_MS>(format!("drive {number}"), ([127, 0, 0, 1].into(), PERIOD), &output);
     let (test, sender): (_, SenderApp) = sender_app(&format!("test {number}"));
     let builder = builder.configure(|config| config.ndl.period = Duration::from_millis(50));
-    let mut builder = builder.app(drive.handles::<Torque>()).app(test);
+    let mut builder = builder.app(drive).app(test);
     if number == 0 {
-        builder = builder.app(AppSpec::new("control", || Control).address(CONTROL));
+        let drives = (0..4).map(|number| format!("drive {number}"));
+        builder = builder.app(commander::<PERIOD_MS>(PERIOD, drives));
     }
     let node = builder.start().expect("a node");
     all_run(&[&node]);
-    Robot { node, view, sender: sender.sender() }
+    Robot { node, output, sender: sender.sender() }
 }
 
 /// Four nodes, of which all drives move.
 fn robots(network: &Loopback) -> Vec<Robot> {
     let robots: Vec<_> =
         (0..4).map(|number| build(network.node(&format!("node {number}")), number)).collect();
-    robots.iter().for_each(|robot| robot.view.wait_until_it_moves());
+    robots.iter().for_each(Robot::wait_until_it_moves);
     // Each is to learn of all others.
     for robot in &robots {
         until("all nodes are known", || (status(robot).nodes.len() == 4).then_some(()));
@@ -164,7 +95,7 @@ fn all_nodes_confirm_and_a_release_moves_nothing() {
     assert!(report.is_confirmed() && report.nodes.len() == 4, "{report:?}");
     assert_eq!((report.presses.len(), report.presses[0].reason.as_str()), (1, "a test"));
     for robot in &robots {
-        let guard = robot.view.guard();
+        let guard = robot.guard();
         assert_eq!(guard.state(), State::Safe(Cause::Stopped));
         assert_eq!(guard.arm(), Err(ArmError::Stopped));
         assert_eq!(guard.acknowledge_stop(), Err(ArmError::Stopped), "it is in force");
@@ -174,16 +105,16 @@ fn all_nodes_confirm_and_a_release_moves_nothing() {
     assert_eq!((report.refused.clone(), report.presses.len()), (None, 0), "{report:?}");
     // Then: commands come again, and nothing moves
     for robot in &robots {
-        let (guard, moved) = (robot.view.guard(), robot.view.moved.load(Ordering::SeqCst));
+        let (guard, moved) = (robot.guard(), robot.output.moved());
         let good = guard.tally().good;
         until("twenty good commands have come", || (guard.tally().good > good + 20).then_some(()));
         assert_eq!((guard.state(), guard.arm()), (State::Safe(Cause::Stopped), Err(ArmError::Stopped)));
-        assert_eq!(robot.view.moved.load(Ordering::SeqCst), moved);
+        assert_eq!(robot.output.moved(), moved);
     }
     // And: a person starts again
     for robot in &robots {
-        robot.view.starts_again.store(true, Ordering::SeqCst);
-        robot.view.wait_until_it_moves();
+        robot.output.set_acknowledges(true);
+        robot.wait_until_it_moves();
     }
 }
 
@@ -201,9 +132,9 @@ fn node_that_starts_during_a_stop_comes_up_stopped() {
     let again = build(network.node("node 3").address(address), 3);
     // Then
     until("it has learned of the stop", || (status(&again).state == StopState::Stopped).then_some(()));
-    let guard = again.view.guard();
+    let guard = again.guard();
     assert_eq!(guard.arm(), Err(ArmError::Stopped));
-    assert_eq!(again.view.moved.load(Ordering::SeqCst), 0);
+    assert_eq!(again.output.moved(), 0);
     until("the others know that", || press_is_confirmed(&robots[0], 4));
     assert!(release(&robots[0]).expect("an answer").refused.is_none());
     assert!(guard.is_stopped() && guard.arm() == Err(ArmError::Stopped), "nothing moves by the release");
@@ -221,17 +152,17 @@ fn stop_outlives_a_node_with_a_state_directory() {
     let start =
         |builder: NodeBuilder| build(builder.configure(|config| config.state = Some(state.clone())), 0);
     let robot = start(network.node("knee"));
-    robot.view.wait_until_it_moves();
+    robot.wait_until_it_moves();
     let address = robot.node.handle().address();
     assert!(press(&robot, WITHIN).is_confirmed());
     until("it is written", || std::fs::read_dir(&state).ok()?.next().map(drop));
     robot.node.stop();
     let again = start(network.node("knee").address(address));
     assert_eq!(status(&again).state, StopState::Stopped);
-    assert_eq!(again.view.guard().arm(), Err(ArmError::Stopped));
+    assert_eq!(again.guard().arm(), Err(ArmError::Stopped));
     assert!(release(&again).expect("an answer").refused.is_none());
-    again.view.starts_again.store(true, Ordering::SeqCst);
-    again.view.wait_until_it_moves();
+    again.output.set_acknowledges(true);
+    again.wait_until_it_moves();
 }
 
 #[test]
@@ -241,12 +172,12 @@ fn release_by_one_that_is_no_operator_is_refused() {
     let path = directory.write("access.toml", list);
     let listed = network.node("knee").configure(|config| config.security.access = Some(path.clone()));
     let robot = build(listed, 0);
-    robot.view.wait_until_it_moves();
+    robot.wait_until_it_moves();
     // Every application of the project may press
     assert!(press(&robot, WITHIN).is_confirmed());
     let report = release(&robot).expect("an answer");
     assert!(report.refused.is_some_and(|why| why.contains("[roles]")) && report.presses.len() == 1);
-    assert_eq!(robot.view.guard().state(), State::Safe(Cause::Stopped));
+    assert_eq!(robot.guard().state(), State::Safe(Cause::Stopped));
     // When: the list names it
     let _ = directory.write("access.toml", &format!("{list}[roles]\noperators = ['test 0']\n"));
     robot.node.handle().reload_access().expect("it has no faults");

@@ -12,7 +12,7 @@ use super::{
     system::{micros, truth},
     table::{
         APP_MISSING, APP_READY, APPS, BARRIER_BLOCKED, BARRIER_WAIT, GUARD_CAUSE, GUARD_FAILED, GUARD_SAFE,
-        MAILBOX_DEPTH, MAILBOX_DEPTH_MAX, RESTARTS,
+        MAILBOX_DEPTH, MAILBOX_DEPTH_MAX, MAILBOX_OLDEST, RESTARTS,
     },
 };
 use crate::{nodes::bounded, snapshot::Answers};
@@ -85,6 +85,9 @@ fn add_tree(samples: &mut Samples, tree: &TreeReport, node: &str, names: &mut Ap
             if let Some(depth) = depth {
                 samples.level(metric, [node, &label], depth as f64);
             }
+        }
+        if line.waiting.is_some() {
+            samples.level(&MAILBOX_OLDEST, [node, &label], micros(line.oldest_us.unwrap_or(0)));
         }
     }
 }

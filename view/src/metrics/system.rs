@@ -6,8 +6,9 @@ use super::{
     samples::Samples,
     table::{
         AGE, ENTRY_UP, FOXGLOVE_CLIENTS, FOXGLOVE_DROPPED, FOXGLOVE_MESSAGES, LEFT_OUT, NODE_FIFO,
-        NODE_IDLE_CLIENTS, NODE_LATENESS, NODE_LOST, NODE_STALL_LONGEST, NODE_STALLS, NODE_STOPPED,
-        NODE_STOPPING, NODE_TROUBLED, NODE_UP, NODE_UPTIME, RECORDER_DROPPED, RECORDER_SEEN, REFUSED, TOOK,
+        NODE_IDLE_CLIENTS, NODE_LATENESS, NODE_LOST, NODE_MEMORY, NODE_STALL_LONGEST, NODE_STALLS,
+        NODE_STOPPED, NODE_STOPPING, NODE_TROUBLED, NODE_UP, NODE_UPTIME, RECORDER_DROPPED, RECORDER_SEEN,
+        REFUSED, RETAINED_BYTES, RETAINED_DROPPED, RETAINED_VALUES, TOOK,
     },
 };
 use crate::{
@@ -74,6 +75,7 @@ pub(super) fn add_node(samples: &mut Samples, answers: &Answers, label: &str) {
     }
     if let Some(measured) = &node.real_time {
         samples.level(&NODE_FIFO, [label], measured.granted.into());
+        samples.level(&NODE_MEMORY, [label], truth(measured.memory == "locked"));
         let quantiles = [
             ("0.5", measured.p50_ns),
             ("0.99", measured.p99_ns),
@@ -87,6 +89,12 @@ pub(super) fn add_node(samples: &mut Samples, answers: &Answers, label: &str) {
     if let Some(recording) = &node.recording {
         samples.count(&RECORDER_SEEN, [label], recording.seen);
         samples.count(&RECORDER_DROPPED, [label], recording.dropped);
+    }
+    if let Some(retained) = &node.retained {
+        samples.level(&RETAINED_VALUES, [label], retained.values as f64);
+        samples.level(&RETAINED_BYTES, [label], retained.bytes as f64);
+        samples.count(&RETAINED_DROPPED, [label, "bound"], retained.not_kept);
+        samples.count(&RETAINED_DROPPED, [label, "member"], retained.not_handed_over);
     }
     samples.level(&LEFT_OUT, [label, "applications"], apps.left_out as f64);
     samples.level(&LEFT_OUT, [label, "barriers"], apps.barriers_left_out as f64);

@@ -103,6 +103,11 @@ pub(super) const NODE_FIFO: Metric = gauge(
     NODE,
     "Priority of SCHED_FIFO that the node got when it measured after its start; 0 if it was refused.",
 );
+pub(super) const NODE_MEMORY: Metric = gauge(
+    "node_memory_locked",
+    NODE,
+    "Whether all memory of the node's process was locked when it measured after its start.",
+);
 pub(super) const NODE_LATENESS: Metric = seconds(
     "node_wake_lateness",
     &["node", "quantile"],
@@ -115,6 +120,15 @@ pub(super) const RECORDER_SEEN: Metric = counter(
 );
 pub(super) const RECORDER_DROPPED: Metric =
     counter("recorder_dropped", &["node"], "Of these, the messages that are in no file.");
+pub(super) const RETAINED_VALUES: Metric =
+    gauge("retained_values", NODE, "Latest values that the node keeps for later members of groups.");
+pub(super) const RETAINED_BYTES: Metric =
+    gauge("retained_bytes", NODE, "Bytes of the retained values of the node.");
+pub(super) const RETAINED_DROPPED: Metric = counter(
+    "retained_dropped",
+    WHY,
+    "Values that later members may lack: beyond a bound of the node, or the member had no room.",
+);
 pub(super) const NODE_STOPPED: Metric =
     gauge("node_stopped", NODE, "Whether the stop of the whole system is in force at the node.");
 pub(super) const NODE_IDLE_CLIENTS: Metric =
@@ -170,6 +184,11 @@ pub(super) const RESTARTS: Metric =
 pub(super) const MAILBOX_DEPTH: Metric = gauge("mailbox_depth", APP, "Messages in the mailbox.");
 pub(super) const MAILBOX_DEPTH_MAX: Metric =
     gauge("mailbox_depth_max", APP, "The most messages that were ever in the mailbox at once.");
+pub(super) const MAILBOX_OLDEST: Metric = seconds(
+    "mailbox_oldest",
+    APP,
+    "Age of the oldest message in the mailbox, since it was sent; 0 if none waits.",
+);
 
 pub(super) const GUARD_SAFE: Metric =
     gauge("guard_safe", APP, "Whether an output that the application guards is safe: no command reaches it.");
@@ -222,10 +241,14 @@ pub const METRICS: &[Metric] = &[
     NODE_STALLS,
     NODE_STALL_LONGEST,
     NODE_FIFO,
+    NODE_MEMORY,
     NODE_STOPPED,
     NODE_LATENESS,
     RECORDER_SEEN,
     RECORDER_DROPPED,
+    RETAINED_VALUES,
+    RETAINED_BYTES,
+    RETAINED_DROPPED,
     NODE_TROUBLED,
     NODE_IDLE_CLIENTS,
     REFUSED,
@@ -252,6 +275,7 @@ pub const METRICS: &[Metric] = &[
     RESTARTS,
     MAILBOX_DEPTH,
     MAILBOX_DEPTH_MAX,
+    MAILBOX_OLDEST,
     GUARD_SAFE,
     GUARD_CAUSE,
     GUARD_FAILED,

@@ -11,8 +11,8 @@ use sinew::{
     audit::{Account, Entry, NodeAudit, Place},
     inspect::{
         AppReport, AppsReport, BarrierReport, DialReport, GuardReport, LinkReport, LostReport, Missing,
-        NodeReport, PeerReport, RealTimeReport, RecordingReport, StallReport, StreamReport, TreeLine,
-        TreeReport, WaitReport,
+        NodeReport, PeerReport, RealTimeReport, RecordingReport, RetainedReport, StallReport, StreamReport,
+        TreeLine, TreeReport, WaitReport,
     },
     message::Class,
     stop::StopState,
@@ -64,6 +64,7 @@ pub(crate) fn node_report(node: NodeAddress, name: &str) -> NodeReport {
         lost_echoes: Vec::new(),
         real_time: None,
         recording: None,
+        retained: None,
         stop: None,
         guards: Vec::new(),
         guards_left_out: 0,
@@ -100,6 +101,7 @@ pub(crate) fn snapshot() -> Snapshot {
     hip.own_stalls = Some(StallReport { count: 2, longest_us: 300_000, last_us: Some(1) });
     hip.real_time = Some(real_time());
     hip.recording = Some(RecordingReport { seen: 900, dropped: 3, ..RecordingReport::default() });
+    hip.retained = Some(RetainedReport { values: 3, bytes: 120, not_kept: 2, not_handed_over: 1 });
     hip.stop = Some(StopState::Stopped);
     hip.peers = vec![peer()];
     hip.guards = [None, Some("Silent")].map(guard).to_vec();
@@ -126,19 +128,9 @@ pub(crate) fn snapshot() -> Snapshot {
 
 /// Returns what the hip has measured after its start.
 fn real_time() -> RealTimeReport {
-    RealTimeReport {
-        wanted: 90,
-        granted: 60,
-        refusals: Vec::new(),
-        memory: "locked".to_owned(),
-        is_preempt_rt: false,
-        period_us: 1_000,
-        turns: 2_000,
-        p50_ns: 4_000,
-        p99_ns: 60_000,
-        p999_ns: 90_000,
-        max_ns: 210_000,
-    }
+    let (p50_ns, p99_ns, p999_ns, max_ns) = (4_000, 60_000, 90_000, 210_000);
+    let memory = "locked".to_owned();
+    RealTimeReport { granted: 60, memory, p50_ns, p99_ns, p999_ns, max_ns, ..RealTimeReport::default() }
 }
 
 /// Returns an output of the drive of the hip.
@@ -229,6 +221,7 @@ fn tree(of: &NodeReport) -> TreeReport {
         place: None,
         waiting: Some(5),
         waiting_most: Some(17),
+        oldest_us: Some(1_500),
         strategy: None,
     };
     TreeReport { name: of.name.clone(), lines: vec![line], left_out: 0 }
@@ -318,12 +311,18 @@ fn samples_have_base_units_and_the_names_of_nodes() {
         ("sinew_peer_clock_offset_seconds{node=\"hip\",peer=\"knee\"}", -0.000_002),
         ("sinew_link_up{node=\"hip\",peer=\"knee\",class=\"control\"}", 1.0),
         ("sinew_restarts_total{node=\"hip\",app=\"drive\"}", 2.0),
+        ("sinew_mailbox_oldest_seconds{node=\"hip\",app=\"drive\"}", 0.0015),
         ("sinew_mailbox_depth_max{node=\"hip\",app=\"drive\"}", 17.0),
         ("sinew_barrier_wait_seconds{node=\"hip\",app=\"gait\"}", 31.0),
         ("sinew_barrier_wait_seconds{node=\"hip\",app=\"drive\"}", 7.0),
         ("sinew_barrier_blocked_seconds{node=\"hip\",app=\"toe\"}", 31.0),
         ("sinew_node_fifo_priority{node=\"hip\"}", 60.0),
+        ("sinew_node_memory_locked{node=\"hip\"}", 1.0),
         ("sinew_node_stopped{node=\"hip\"}", 1.0),
+        ("sinew_retained_values{node=\"hip\"}", 3.0),
+        ("sinew_retained_bytes{node=\"hip\"}", 120.0),
+        ("sinew_retained_dropped_total{node=\"hip\",why=\"bound\"}", 2.0),
+        ("sinew_retained_dropped_total{node=\"hip\",why=\"member\"}", 1.0),
         ("sinew_node_wake_lateness_seconds{node=\"hip\",quantile=\"0.999\"}", 90e-6),
         ("sinew_guard_safe{node=\"hip\",app=\"drive\"}", 1.0),
         ("sinew_guard_safe_cause{node=\"hip\",app=\"drive\",why=\"Silent\"}", 1.0),

@@ -113,6 +113,7 @@ impl Answers {
             lost_echoes: refused::lost_echoes(state, now),
             real_time: state.real_time.report(),
             recording: Some(state.recording.report_state()),
+            retained: Some(state.ctx.router.retained().into()),
             stop: Some(state.ctx.router.stop().read().state()),
             guards,
             guards_left_out,
@@ -304,6 +305,7 @@ fn add_lines(lines: &mut Vec<TreeLine>, depth: u32, one: &Supervised) {
         place: one.place.clone(),
         waiting: one.mailbox.map(|mailbox| mailbox.depth as u64),
         waiting_most: one.mailbox.map(|mailbox| mailbox.high_water as u64),
+        oldest_us: one.mailbox.and_then(|mailbox| mailbox.oldest).map(micros),
         strategy: one.supervises.as_ref().map(|below| strategy(below.flags.strategy).to_owned()),
     });
     for child in one.supervises.iter().flat_map(|below| &below.children) {

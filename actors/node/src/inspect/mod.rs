@@ -49,10 +49,10 @@ pub use reports::{
     FrozenSpan, GroupReport, GuardReport, IdleReport, KindReport, LOG_LINES_MAX, LinkReport, LogLine,
     LogsReport, LostEchoReport, LostReport, MismatchReport, MismatchesReport, Missing, NodeReport, PEERS_MAX,
     PeerReport, Ping, REACHED_MAX, RECORDED_MAX, ReachReport, Reached, RealTimeReport, RecordCounts,
-    RecordReport, RecordedApp, RecordedType, RecordingReport, RefusalReport, ReloadReport, RouteReport,
-    SCHEMAS_MAX, SEEN_BYTES_MAX, SEEN_MAX, SchemaReport, SchemasReport, SecurityReport, SeenMessage,
-    SourceReport, StallReport, StreamReport, TREE_MAX, TreeLine, TreeReport, TroubleReport, TypeUser,
-    UnguardedReport, UnhandledReport, WaitReport, WatchReport,
+    RecordReport, RecordedApp, RecordedType, RecordingReport, RefusalReport, ReloadReport, RetainedReport,
+    RouteReport, SCHEMAS_MAX, SEEN_BYTES_MAX, SEEN_MAX, SchemaReport, SchemasReport, SecurityReport,
+    SeenMessage, SourceReport, StallReport, StreamReport, TREE_MAX, TreeLine, TreeReport, TroubleReport,
+    TypeUser, UnguardedReport, UnhandledReport, WaitReport, WatchReport,
 };
 pub use sinew_record::{PeerClock, Selection};
 

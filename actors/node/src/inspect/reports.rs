@@ -13,6 +13,7 @@ mod reach;
 mod real_time;
 mod record;
 mod refused;
+mod retained;
 mod security;
 mod tree;
 mod types;
@@ -31,6 +32,7 @@ pub use peers::{
 pub use reach::{AskGroups, AskReach, GroupReport, REACHED_MAX, ReachReport, Reached};
 pub use real_time::RealTimeReport;
 pub use refused::{LostEchoReport, RefusalReport, UnguardedReport, UnhandledReport};
+pub use retained::RetainedReport;
 pub use security::{CertificateReport, SecurityReport};
 pub use tree::{AskTree, TREE_MAX, TreeLine, TreeReport};
 pub use types::{

@@ -1,19 +1,11 @@
 /* Never settles messages of kind test.held, and doubles torques. */
-#include <sinew.h>
-
-#include <stdio.h>
+#include "fail.h"
 
 #define MAX_HELD 8
 
 struct torque { float newton_metres; };
 static const sinew_field torque_fields[] = { SINEW_FIELD(struct torque, newton_metres) };
 static const sinew_payload_type torque_type = SINEW_PAYLOAD("test.torque", SINEW_CONTROL, struct torque, torque_fields);
-
-static int fail(const char *what, sinew_status status)
-{
-    printf("%s: %d: %s\n", what, (int)status, sinew_last_error());
-    return 1;
-}
 
 static sinew_status reply_doubled(sinew_endpoint *holder, const sinew_received *request, struct torque torque)
 {

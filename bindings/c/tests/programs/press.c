@@ -1,19 +1,5 @@
 /* Presses the stop of the whole system, releases it by a message, and acknowledges it. */
-#include <sinew.h>
-
-#include <stdio.h>
-#include <stdlib.h>
-
-#define SECOND UINT64_C(1000000000)
-#define EXPECT(claim) expect(__LINE__, #claim, (claim))
-
-static void expect(int line, const char *claim, int holds)
-{
-    if (holds)
-        return;
-    printf("line %d: not so: %s; %s\n", line, claim, sinew_last_error());
-    exit(EXIT_FAILURE);
-}
+#include "expect.h"
 
 struct release {
     uint32_t within_ms;

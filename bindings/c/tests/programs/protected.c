@@ -1,26 +1,14 @@
 /* The rules of a guard, without a node: each error once, silence, and that it stays safe until it is armed again. */
 #define _POSIX_C_SOURCE 200809L
 
-#include <sinew.h>
+#include "expect.h"
 
 #include <stdatomic.h>
-#include <stdio.h>
-#include <stdlib.h>
 #include <sys/wait.h>
 #include <time.h>
 #include <unistd.h>
 
 #define MS UINT64_C(1000000)
-#define SECOND UINT64_C(1000000000)
-#define EXPECT(claim) expect(__LINE__, #claim, (claim))
-
-static void expect(int line, const char *claim, int holds)
-{
-    if (holds)
-        return;
-    printf("line %d: not so: %s; %s\n", line, claim, sinew_last_error());
-    exit(EXIT_FAILURE);
-}
 
 struct torque { float newton_metres; uint32_t number; };
 

@@ -1,19 +1,5 @@
 /* Sends to itself through a node that is stopped: the status without room, and that no message is lost. */
-#include <sinew.h>
-
-#include <stdio.h>
-#include <stdlib.h>
-
-#define SECOND UINT64_C(1000000000)
-#define EXPECT(claim) expect(__LINE__, #claim, (claim))
-
-static void expect(int line, const char *claim, int holds)
-{
-    if (holds)
-        return;
-    printf("line %d: not so: %s; %s\n", line, claim, sinew_last_error());
-    exit(EXIT_FAILURE);
-}
+#include "expect.h"
 
 /* The test gives the signal to continue. */
 static void await_word(const char *before)

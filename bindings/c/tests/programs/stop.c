@@ -1,16 +1,8 @@
 /* Takes commands without fields, each with a reply of the same type. In C99, C11 and C++. */
-#include <sinew.h>
-
-#include <stdio.h>
+#include "fail.h"
 
 static const sinew_payload_type stop_type = SINEW_PAYLOAD_EMPTY("test.stop", SINEW_CONTROL);
 static const sinew_payload_type brief_type = SINEW_PAYLOAD_EMPTY_EXPIRING("test.brief_stop", SINEW_CONTROL, UINT64_C(60000000000));
-
-static int fail(const char *what, sinew_status status)
-{
-    printf("%s: %d: %s\n", what, (int)status, sinew_last_error());
-    return 1;
-}
 
 /* The command comes back to its sender, once as a reply and once as a message that expires. */
 static sinew_status send_back(sinew_endpoint *stopping, const sinew_received *request)

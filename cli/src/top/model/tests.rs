@@ -6,7 +6,7 @@ use sinew::{
     Tid, Time,
     address::Incarnation,
     audit::Entry,
-    inspect::{AppsReport, RealTimeReport, StallReport, TreeLine, TreeReport},
+    inspect::{AppsReport, RealTimeReport, RetainedReport, StallReport, TreeLine, TreeReport},
 };
 
 use super::*;
@@ -44,6 +44,7 @@ fn tree() -> TreeReport {
         place: None,
         waiting: Some(3),
         waiting_most: Some(9),
+        oldest_us: Some(1_500),
         strategy: None,
     };
     TreeReport { name: "hip".to_owned(), lines: vec![line], left_out: 0 }
@@ -68,19 +69,8 @@ fn hip(seconds: u64) -> Answers {
         links: vec![link],
         ..PeerReport::lost(KNEE, Incarnation(1))
     };
-    let real_time = RealTimeReport {
-        wanted: 90,
-        granted: 60,
-        refusals: Vec::new(),
-        memory: "locked".to_owned(),
-        is_preempt_rt: false,
-        period_us: 1_000,
-        turns: 2_000,
-        p50_ns: 4_000,
-        p99_ns: 60_000,
-        p999_ns: 90_000,
-        max_ns: 210_000,
-    };
+    let real_time =
+        RealTimeReport { granted: 60, p99_ns: 60_000, max_ns: 210_000, ..RealTimeReport::default() };
     let node = NodeReport {
         node: HIP,
         up_us: seconds * 1_000_000,
@@ -88,6 +78,7 @@ fn hip(seconds: u64) -> Answers {
         real_time: Some(real_time),
         peers: vec![peer],
         stop: Some(StopState::Released),
+        retained: Some(RetainedReport { values: 4, bytes: 90, not_kept: 1, not_handed_over: 2 }),
         ..node_report("hip", 7, None)
     };
     let audit = NodeAudit {
@@ -141,14 +132,27 @@ fn tables_have_states_queues_and_rates() {
     assert_eq!(
         rows(&model, "Nodes"),
         [
-            row(["hip", "192.168.0.7", "up", "released", "12.0 s", "60", "60 us", "210 us", "2", "300.0 ms"]),
-            row(["knee", "192.168.0.8", "no answer", "-", "-", "-", "-", "-", "-", "-"]),
+            row([
+                "hip",
+                "192.168.0.7",
+                "up",
+                "released",
+                "12.0 s",
+                "60",
+                "60 us",
+                "210 us",
+                "2",
+                "300.0 ms",
+                "4",
+                "3",
+            ]),
+            row(["knee", "192.168.0.8", "no answer", "-", "-", "-", "-", "-", "-", "-", "-", "-"]),
         ]
     );
     // This command itself is not shown.
     assert_eq!(
         rows(&model, "Applications"),
-        [row(["drive", "hip", "ready", "50.0", "-", "3", "9", "1", "-"])]
+        [row(["drive", "hip", "ready", "50.0", "-", "3", "9", "1.5 ms", "1", "-"])]
     );
     assert_eq!(
         rows(&model, "Links"),

@@ -99,6 +99,7 @@ fn report(number: u8, name: &str, other: u8) -> NodeReport {
         lost_echoes: Vec::new(),
         real_time: None,
         recording: None,
+        retained: None,
         stop: None,
         guards: Vec::new(),
         guards_left_out: 0,
@@ -133,6 +134,7 @@ fn app(name: &str) -> App {
         place: None,
         waiting: Some(0),
         waiting_most: Some(3),
+        oldest_us: None,
         strategy: None,
     };
     App { report: Some(report), unreported: None, line: Some(line), refused: 0, direct: Vec::new() }

@@ -13,6 +13,7 @@ use exoskeleton_model::joint::Joint;
 use exoskeleton_model::message::{DriveState, DriveStatus};
 use sinew::stop::{AskStop, ReleaseStop, StopReport, StopState};
 use sinew::{AppAddress, Endpoint, NodeAddress, NodeApi, Outcome, Payload, Registration, Tid};
+use sinew_figures::{Alone, Figures, head};
 
 use crate::{DEADLINE, SOCKETS, alone, end, folder, start};
 
@@ -24,6 +25,11 @@ const NODES: [&str; 4] = ["hip", "knee", "ankle", "central"];
 const WITHIN: Duration = Duration::from_secs(20);
 /// Statuses of each drive in which nothing may move.
 const STATUSES: u32 = 100;
+/// The environment variable that sets the number of presses of the long run.
+const PRESSES_WANTED: &str = "SINEW_STOP_PRESSES";
+const PRESSES: u32 = 100;
+/// Statuses of all drives in a stride and more, so that presses come at many phases.
+const STRIDE_STATUSES: u32 = 400;
 
 /// The robot, each part in a process that this test has started.
 struct Robot {
@@ -96,6 +102,11 @@ impl Robot {
         }
     }
 
+    /// Returns the place of a node: the joints in turn, then central.
+    fn place(&self, number: u32) -> &NodePlace {
+        self.topology.joints.get(number as usize % NODES.len()).unwrap_or(&self.topology.central)
+    }
+
     /// The person at central: it also reads the statuses of the drives.
     fn person(&self) -> Person {
         let mut endpoint = self.endpoint(&self.topology.central);
@@ -148,6 +159,16 @@ impl Person {
                 "{when}: drive {drive}: {status:?}"
             );
             counts[drive] += 1;
+        }
+    }
+
+    /// Reads so many statuses.
+    #[track_caller]
+    fn watch(&mut self, statuses: u32) {
+        let (deadline, mut left) = (Instant::now() + DEADLINE, statuses);
+        while left > 0 {
+            assert!(Instant::now() < deadline, "{statuses} statuses within {DEADLINE:?}, {left} are missing");
+            left -= u32::from(self.next_status().is_some());
         }
     }
 
@@ -255,4 +276,55 @@ fn stop_of_the_walking_robot_lasts_until_its_reset() {
     drop(person);
     robot.end();
     let _ = std::fs::remove_dir_all(&folder);
+}
+
+/// The times of one node over all presses.
+#[derive(Default)]
+struct Times {
+    /// From the press until its confirmation was at the node of the press: then its output was safe.
+    confirmed: Figures,
+    /// From its own knowledge of the press until its outputs were safe.
+    safe: Figures,
+}
+
+#[test]
+#[ignore = "it walks as many times as SINEW_STOP_PRESSES says, some seconds each"]
+fn each_press_on_the_walking_robot_is_confirmed() {
+    let wanted = std::env::var(PRESSES_WANTED).ok();
+    let presses = wanted.map_or(PRESSES, |wanted| wanted.parse().expect("a number of presses"));
+    let _alone = alone();
+    let folder = folder("presses");
+    let robot = Robot::start(&folder);
+    let mut person = robot.person();
+    let mut nodes: BTreeMap<String, Times> = BTreeMap::new();
+    person.until_all(DriveState::Walk);
+    for number in 0..presses {
+        person.watch(number * 37 % STRIDE_STATUSES);
+        // when
+        let mut button = robot.endpoint(robot.place(number));
+        let report = button.press_stop(REASON, WITHIN).expect("its node answers");
+        // then
+        assert!(report.is_confirmed() && report.nodes.len() == NODES.len(), "press {number}: {report:?}");
+        for node in report.nodes {
+            let times = nodes.entry(node.name).or_default();
+            let recorded = [(&mut times.confirmed, node.confirmed_us), (&mut times.safe, node.safe_us)];
+            for (figures, micros) in recorded {
+                figures.record(Duration::from_micros(micros.expect("it has confirmed")));
+            }
+        }
+        person.until_all(DriveState::EStop);
+        person.release();
+        person.nothing_moves("after the release");
+        person.walk_again();
+    }
+    drop(person);
+    robot.end();
+    let _ = std::fs::remove_dir_all(&folder);
+    head();
+    for (case, Times { confirmed, safe }) in &nodes {
+        for (figure, seen) in [("press to confirmation", confirmed), ("own knowledge to safe outputs", safe)]
+        {
+            Alone { bench: "stop_of_the_robot", case, figure, seen, counts: &[] }.report();
+        }
+    }
 }

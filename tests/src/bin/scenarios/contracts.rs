@@ -1,4 +1,4 @@
-//! Loses, pauses and stops the sender of two outputs on other nodes many times, and reports the time until each output
+//! Loses, pauses, delays and stops the sender of two outputs on other nodes many times, and reports the time until each output
 //! was safe against the time of its contract.
 //!
 //! `cargo run --release -p sinew-tests -- contracts [OPTIONS]`.
@@ -10,10 +10,11 @@ use std::process::ExitCode;
 use clap::Args;
 use sinew_tests::contracts::{Plan, run};
 
-/// Loses, pauses and stops the sender of two outputs on other nodes many times.
+/// Loses, pauses, delays and stops the sender of two outputs on other nodes many times.
 ///
 /// Three nodes on loopback, each in a process of its own: `central` commands an output on `left` and on `right`. In
-/// turn its process is killed, paused, stopped in order, and the stop of the whole system is pressed.
+/// turn its process is killed, paused, cut off from the echoes of the outputs, stopped in order, and the stop of the
+/// whole system is pressed.
 #[derive(Args)]
 pub(super) struct Arguments {
     /// Number of injected conditions.

@@ -10,8 +10,8 @@ use sinew_runtime::{
 
 use super::{
     ForeignReport, GuardReport, IdleReport, LISTED_MAX, LostEchoReport, LostReport, PeerReport,
-    RealTimeReport, RecordingReport, RefusalReport, Report, SecurityReport, Shortened, SourceReport,
-    StallReport, TroubleReport, UnguardedReport, UnhandledReport,
+    RealTimeReport, RecordingReport, RefusalReport, Report, RetainedReport, SecurityReport, Shortened,
+    SourceReport, StallReport, TroubleReport, UnguardedReport, UnhandledReport,
 };
 
 /// Maximum number of nodes in one answer.
@@ -148,6 +148,9 @@ pub struct NodeReport {
     /// The state of its recording; `None`: an older version.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub recording: Option<RecordingReport>,
+    /// The values that it retains for later members of groups; `None`: an older version.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub retained: Option<RetainedReport>,
     /// Whether the system is stopped, as the outputs of the node see it; `None`: an older version.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub stop: Option<StopState>,

@@ -18,7 +18,7 @@ const REFUSALS_MAX: usize = 8;
 ///     report.real_time.as_ref().is_some_and(|found| found.granted > 0 && found.max_ns <= 200_000)
 /// }
 /// ```
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct RealTimeReport {
     /// The SCHED_FIFO priority that the thread requested.
     pub wanted: u8,

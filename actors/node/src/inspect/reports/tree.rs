@@ -58,6 +58,9 @@ pub struct TreeLine {
     pub waiting: Option<u64>,
     /// Maximum number of messages that ever waited at once.
     pub waiting_most: Option<u64>,
+    /// Age of the oldest one that waits; `None`: none waits, or an older version.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub oldest_us: Option<u64>,
     /// For a supervisor: which children it restarts when one fails.
     pub strategy: Option<String>,
 }
