@@ -1,11 +1,8 @@
 //! The files that a package ships beside the programs: manual pages, completions, and those of `sinew-node`.
 
-use std::{
-    collections::BTreeSet,
-    path::{Path, PathBuf},
-    process::Command,
-};
+use std::{collections::BTreeSet, path::Path, process::Command};
 
+use serde_json::Value;
 use sinew_testkit::{TestDirectory, program};
 
 use crate::scenario::{Answer, sinew};
@@ -29,9 +26,9 @@ fn all() -> BTreeSet<String> {
     all
 }
 
-/// Returns a file of the folder `packages/node`.
-fn shipped(file: &str) -> String {
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../packages/node").join(file);
+/// Returns a file of the project.
+fn read(file: &str) -> String {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("..").join(file);
     std::fs::read_to_string(&path).unwrap_or_else(|error| panic!("{}: {error}", path.display()))
 }
 
@@ -93,9 +90,9 @@ fn files_of_the_node_have_its_options() {
     let words = help.split(|letter: char| !letter.is_alphanumeric() && letter != '-');
     let options: BTreeSet<_> = words.filter_map(|word| word.strip_prefix("--")).collect();
     assert!(options.contains("help"), "{help}");
-    let page = shipped("sinew-node.1").replace('\\', "");
+    let page = read("packages/node/sinew-node.1").replace('\\', "");
     for file in ["completion.bash", "completion.zsh", "completion.fish"] {
-        let text = shipped(file);
+        let text = read(&format!("packages/node/{file}"));
         for option in &options {
             assert!(text.contains(option), "{file} does not complete --{option}");
         }
@@ -114,8 +111,6 @@ fn files_of_the_node_have_its_options() {
 
 #[test]
 fn unit_of_the_package_is_that_of_the_book() {
-    let root = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("..");
-    let read = |path: &str| std::fs::read_to_string(root.join(path)).expect("the file is there");
     let unit = read("packages/debian/sinew-node@.service");
     let page = read("docs/book/src/how-to/systemd.md");
     let (_, rest) = page.split_once("```ini\n").expect("the page has a unit");
@@ -129,4 +124,38 @@ fn unit_of_the_package_is_that_of_the_book() {
     assert!(shown.contains("Type=notify"), "{shown:?}");
     let missing: Vec<_> = shown.difference(&unit).collect();
     assert!(missing.is_empty(), "packages/debian/sinew-node@.service has not: {missing:?}");
+}
+
+#[test]
+fn options_of_containers_are_explained() {
+    let container: Value =
+        serde_json::from_str(&read(".devcontainer/devcontainer.json")).expect("it is JSON without comments");
+    let page = read("docs/book/src/how-to/containers.md");
+    let options = container["runArgs"].as_array().expect("a list of options");
+    assert!(options.iter().any(|option| option == "--ulimit=rtprio=99"), "{options:?}");
+    for option in options {
+        let option = option.as_str().expect("an option is a text");
+        let apart = option.replacen('=', " ", 1);
+        assert!(page.contains(option) || page.contains(&apart), "the page does not explain {option}");
+    }
+}
+
+#[test]
+fn container_to_develop_in_has_the_tools_of_the_checks() {
+    let run = read(".ci/run");
+    let (_, rest) = run.split_once("tools=(\n").expect("it has a list of tools");
+    let (tools, _) = rest.split_once("\n)").expect("the list ends");
+    let packages: BTreeSet<_> = tools
+        .lines()
+        .map(|line| line.split_whitespace().nth(1).expect("a command, and its package"))
+        .collect();
+    assert!(packages.contains("valgrind"), "{packages:?}");
+    let prepare = read("packages/prepare");
+    let (_, develop) = prepare.split_once("\ndevelop)\n").expect("it has a part for developers");
+    let installed: BTreeSet<_> = develop.split_whitespace().collect();
+    let missing: Vec<_> = packages.difference(&installed).collect();
+    assert!(missing.is_empty(), "packages/prepare develop does not install {missing:?}");
+    for file in ["Dockerfile", "packages/check"] {
+        assert!(read(file).contains("packages/prepare"), "{file} has a preparation of its own");
+    }
 }
