@@ -8,7 +8,7 @@ use crate::{bag, keys, logs, param, play, record, send, stop, up, view, watch, w
 
 /// Shows a running Sinew system, from any one node of it. It changes nothing, except that `send` and `play` send
 /// messages, `param` and the page of `view` set parameters, `stop` stops the system, `up` and `down` start and end its
-/// nodes, and `keys`, `record` and `bag` write files.
+/// nodes, and `keys`, `record`, `bag` and `man` write files.
 ///
 /// It connects to the socket of a node on this machine (`lncl.socket` in the node's configuration) and asks
 /// that node, and through it all others.
@@ -323,6 +323,14 @@ pub(crate) enum Command {
         /// Which shell
         shell: clap_complete::Shell,
     },
+    /// Writes a manual page of each command, for `man`
+    #[command(after_help = r#"Examples:
+  sinew man ~/.local/share/man/man1 && man sinew-why"#)]
+    Man {
+        /// An existing folder
+        #[arg(value_name = "DIR")]
+        folder: PathBuf,
+    },
 }
 
 /// Reads the length of a measurement.
@@ -333,7 +341,7 @@ fn seconds(text: &str) -> Result<Duration, String> {
 }
 
 /// Commands that send no request to a node: the options that select a node and its time limit do not apply to them.
-const ASK_NO_NODE: [&str; 7] = ["up", "down", "status", "host", "keys", "bag", "completions"];
+const ASK_NO_NODE: [&str; 8] = ["up", "down", "status", "host", "keys", "bag", "completions", "man"];
 
 /// The command, as its help shows it.
 pub(crate) fn command() -> clap::Command {
@@ -389,4 +397,5 @@ Examples:
   sinew apps --json | jq '.apps[] | select(.ready | not)'
   sinew --socket /run/sinew/knee.sock barriers
   sinew keys init walker hip=192.168.0.11 knee=192.168.0.12 && sinew keys show
-  sinew completions bash > ~/.local/share/bash-completion/completions/sinew";
+  sinew completions bash > ~/.local/share/bash-completion/completions/sinew
+  sinew man ~/.local/share/man/man1";

@@ -19,6 +19,7 @@ mod contracts;
 mod doctor;
 mod keys;
 mod logs;
+mod man;
 mod messagepack;
 mod nodes;
 mod output;
@@ -165,6 +166,7 @@ fn run(arguments: &Arguments) -> Result<Report, SystemError> {
         Command::Keys(order) => keys::show(order, arguments.wide),
         Command::Bag(order) => bag::show(order, arguments.wide),
         Command::Completions { shell } => Ok(completions(*shell)),
+        Command::Man { folder } => man::write(folder),
     }
 }
 

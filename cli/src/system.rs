@@ -61,6 +61,9 @@ pub(crate) enum SystemError {
     /// A robot cannot be started, changed or stopped.
     #[error("{0}")]
     Up(String),
+    /// A manual page cannot be written.
+    #[error("{0}")]
+    Man(String),
     /// The command line is invalid.
     #[error("{0}")]
     Usage(String),
@@ -83,7 +86,8 @@ impl SystemError {
             | Self::Keys(_)
             | Self::Bag(_)
             | Self::View(_)
-            | Self::Up(_) => EXIT_FINDING,
+            | Self::Up(_)
+            | Self::Man(_) => EXIT_FINDING,
             Self::Usage(_) => EXIT_USAGE,
             Self::NoSocket(_) | Self::NotRegistered(..) | Self::NoAnswer(..) => EXIT_NO_NODE,
         }

@@ -110,6 +110,56 @@ fn picture_of_the_packages_is_true() {
     }
 }
 
+/// Returns the faults of one dependency of a published package.
+fn unpublishable(needed: &Value, published: &BTreeMap<String, String>) -> Option<String> {
+    let name = needed["name"].as_str().expect("it has a name");
+    // A dependency from elsewhere has no path.
+    needed["path"].as_str()?;
+    let asked = needed["req"].as_str().expect("it has a version or a star");
+    if needed["kind"] == "dev" {
+        let is_left_out = asked == "*";
+        return (!is_left_out)
+            .then(|| format!("names {name} with a version in its tests: write its path alone"));
+    }
+    match published.get(name) {
+        None => Some(format!("stands on {name}, which is not published")),
+        Some(version) if asked == format!("^{version}") => None,
+        Some(version) => Some(format!("asks for {name} {asked}, and the workspace has {version}")),
+    }
+}
+
+#[test]
+fn published_packages_are_complete() {
+    let all = metadata();
+    let text = |of: &Value, key: &str| of[key].as_str().unwrap_or_default().to_owned();
+    let (open, own): (Vec<_>, Vec<_>) = all.iter().partition(|package| package["publish"].is_null());
+    let published: BTreeMap<_, _> =
+        open.iter().map(|package| (text(package, "name"), text(package, "version"))).collect();
+    assert!(published.contains_key("sinew") && published.contains_key("sinew-cli"), "{published:?}");
+    for package in open {
+        let name = text(package, "name");
+        for key in ["description", "license", "readme", "rust_version"] {
+            assert!(!text(package, key).is_empty(), "{name} has no {key}");
+        }
+        for key in ["keywords", "categories"] {
+            assert!(package[key].as_array().is_some_and(|words| !words.is_empty()), "{name} has no {key}");
+        }
+        let folder = PathBuf::from(text(package, "manifest_path"));
+        for licence in ["LICENSE-MIT", "LICENSE-APACHE"] {
+            assert!(folder.with_file_name(licence).is_file(), "{name} has no {licence}");
+        }
+        let needs = package["dependencies"].as_array().expect("a list of dependencies");
+        let faults: Vec<_> = needs.iter().filter_map(|needed| unpublishable(needed, &published)).collect();
+        assert!(faults.is_empty(), "{name} {}", faults.join("; it "));
+    }
+    for package in own {
+        let path = text(package, "manifest_path");
+        let inside = Path::new(&path).strip_prefix(root()).expect("it is in the workspace");
+        let is_inner = ["tests", "benches", "examples", "bindings"].iter().any(|top| inside.starts_with(top));
+        assert!(is_inner, "{path}: say `publish = true`, or move it to the tests, benches or examples");
+    }
+}
+
 /// Returns the folders of all crates with a folder of their own: libraries, programs, tests and benches.
 fn crate_folders() -> BTreeSet<PathBuf> {
     let mut folders = BTreeSet::new();

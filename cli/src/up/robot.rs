@@ -5,6 +5,8 @@ mod reader;
 mod reference;
 mod rows;
 #[cfg(test)]
+mod schema_tests;
+#[cfg(test)]
 mod tests;
 
 use std::{

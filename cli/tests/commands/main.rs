@@ -18,6 +18,7 @@ mod reference;
 mod scenario;
 mod secured;
 mod send;
+mod shipped;
 mod stop;
 mod top;
 mod up;
@@ -212,7 +213,7 @@ fn wrong_usage_exits_with_2() {
 
 #[test]
 fn help_of_offline_commands_omits_node_options() {
-    for words in [&["keys"][..], &["keys", "init"], &["keys", "show"], &["completions"]] {
+    for words in [&["keys"][..], &["keys", "init"], &["keys", "show"], &["completions"], &["man"]] {
         for help in ["--help", "-h"] {
             let answer = sinew(&[words, &[help]].concat(), Path::new("/"));
             assert_eq!(answer.code, Some(0), "{}", answer.err);
@@ -465,17 +466,4 @@ fn socket_of_a_killed_node_is_a_finding() {
     // Then
     let check = leftover();
     assert!(names(&check, "hip.sock") && !names(&check, "knee.sock"), "{check}");
-}
-
-#[test]
-fn completions_of_every_shell_have_the_commands() {
-    for shell in ["bash", "zsh", "fish"] {
-        let answer = sinew(&["completions", shell], Path::new("/"));
-        assert!(
-            answer.code == Some(0) && answer.out.contains("barriers"),
-            "{shell}: {}{}",
-            answer.out,
-            answer.err
-        );
-    }
 }

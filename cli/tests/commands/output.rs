@@ -8,11 +8,12 @@ use std::{
 use crate::scenario::{Answer, Scenario};
 
 /// One invocation of each command that ends by itself, for a node called `hip`.
-const COMMANDS: [&[&str]; 19] = [
+const COMMANDS: [&[&str]; 20] = [
     &["--help"],
     &["--version"],
     &["watch", "--help"],
     &["completions", "bash"],
+    &["man", "."],
     &["keys", "init", "walker", "hip=127.0.0.1"],
     &["keys", "show"],
     &["nodes"],
@@ -33,7 +34,7 @@ const COMMANDS: [&[&str]; 19] = [
 /// Runs a command with this standard output and standard error.
 fn run(scenario: &Scenario, words: &[&str], out: Stdio, err: Stdio) -> Answer {
     let mut command = Command::new(env!("CARGO_BIN_EXE_sinew"));
-    let asks_no_node = matches!(words[0], "keys" | "completions") || words.contains(&"--help");
+    let asks_no_node = matches!(words[0], "keys" | "completions" | "man") || words.contains(&"--help");
     if !asks_no_node {
         command.arg("--socket").arg(scenario.socket("hip"));
     }

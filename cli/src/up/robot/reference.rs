@@ -86,7 +86,7 @@ fn tables() -> String {
 }
 
 /// Returns the JSON Schema of a robot file.
-fn schema() -> Value {
+pub(super) fn schema() -> Value {
     let of = |table: Table| {
         let mut keys = Map::new();
         for row in rows(table) {
