@@ -392,6 +392,7 @@ impl Child {
             | Order::Introduce { .. }
             | Order::Switch { .. }
             | Order::DeclareType(_)
+            | Order::Ready
             | Order::Observe(_)
             | Order::Unregister => {
                 return Err("it sent a frame that only a client of LNCL may send".to_owned());
