@@ -118,8 +118,8 @@ pub mod barrier {
 pub mod config {
     #[doc(inline)]
     pub use sinew_model::config::{
-        AppSettings, ConfigError, ConfigFault, ContractsConfig, Families, GnclConfig, Interface,
-        InterfaceError, Interfaces, LnclConfig, LogConfig, LogLevel, NdlConfig, NodeConfig,
+        AppSettings, CommandConfig, ConfigError, ConfigFault, ContractsConfig, Families, GnclConfig,
+        Interface, InterfaceError, Interfaces, LnclConfig, LogConfig, LogLevel, NdlConfig, NodeConfig,
         RecordCompression, RecordConfig, RtConfig, SecurityConfig, Seed, SeedError, StopConfig,
         SupervisionConfig, SyncConfig, TimePolicy, WatchGroup,
     };

@@ -1,0 +1,92 @@
+//! A node with commands, and the program of a command.
+//!
+//! `command_node CONFIG.toml` is a node without applications but the commands of its file.
+//!
+//! `commanded [--dies-at-start CODE] [--never-registers] [--ready-when FILE]` is a program for such a file. It registers
+//! the name of its command, and follows orders.
+
+use std::{path::Path, process::ExitCode, time::Duration};
+
+use rustix::process::{Signal, getpid, kill_process};
+use sinew::{Endpoint, Node, NodeApi, NodeConfig, Outcome, Payload, Registration, client::Received};
+use sinew_testkit::{DEADLINE, until};
+
+use super::Options;
+use crate::orders::{Count, Me, Order, Who};
+
+fn print_line(what: &str) {
+    println!("{what}");
+}
+
+pub(super) fn run_node(arguments: &[String]) -> ExitCode {
+    let config = NodeConfig::from_file(&arguments[0]).expect("a scenario's configuration");
+    match Node::builder(config.name.clone()).config(config).heed_signals().start() {
+        Ok(node) => {
+            print_line("is up");
+            node.run()
+        }
+        Err(error) => {
+            print_line(&format!("refused {error}"));
+            ExitCode::FAILURE
+        }
+    }
+}
+
+pub(super) fn run_program(arguments: &[String]) -> ExitCode {
+    let options = Options(arguments);
+    let variable = |name: &str| std::env::var(name).expect("the node sets it");
+    let (socket, name) = (variable("SINEW_SOCKET"), variable("SINEW_NAME"));
+    print_line(&format!("program {} of {name} started", std::process::id()));
+    if let Some(code) = options.value("--dies-at-start") {
+        std::process::exit(code.parse().expect("an exit code"));
+    }
+    while options.has("--never-registers") {
+        std::thread::sleep(Duration::from_secs(60));
+    }
+    let api = NodeApi::connect(socket).expect("the node runs");
+    let registration = Registration::new().name(name);
+    let mut endpoint = api.register_transport_address(registration).expect("the name is its own");
+    if let Some(file) = options.value("--ready-when") {
+        until("the test to allow it", || Path::new(&file).exists().then_some(()));
+        endpoint.ready().expect("the node runs");
+    }
+    let mut counts = Vec::new();
+    loop {
+        let received = endpoint.receive(DEADLINE).expect("the node runs");
+        let Some(received) = received else { continue };
+        match received.kind() {
+            Count::KIND => counts.push(received.decode::<Count>().expect("it is one").number),
+            Who::KIND => {
+                let me = Me { pid: std::process::id(), counts: counts.clone() };
+                endpoint.reply(&received, &me).expect("the node runs");
+            }
+            Order::KIND => match received.decode().expect("it is one") {
+                Order::Stop => return stop(endpoint, received),
+                order => execute(&order),
+            },
+            _ => received.settle(Outcome::Failed),
+        }
+    }
+}
+
+/// Ends in order.
+fn stop(endpoint: Endpoint, received: Received) -> ExitCode {
+    received.settle(Outcome::Delivered);
+    endpoint.unregister().expect("the node runs");
+    ExitCode::SUCCESS
+}
+
+fn execute(order: &Order) {
+    match order {
+        Order::Exit(code) => std::process::exit(*code),
+        Order::Kill => kill_process(getpid(), Signal::KILL).expect("it is this process"),
+        Order::Hang => loop {
+            std::thread::sleep(Duration::from_secs(60));
+        },
+        Order::StartASleeper(_) => {
+            let sleeper = std::process::Command::new("sleep").arg("120").spawn();
+            print_line(&format!("sleeper {}", sleeper.expect("every system has it").id()));
+        }
+        other => panic!("{other:?} is for another application"),
+    }
+}
