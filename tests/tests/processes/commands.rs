@@ -102,7 +102,7 @@ impl Other {
 }
 
 #[test]
-fn program_is_ready_when_it_has_registered_and_its_output_is_logged() {
+fn registered_program_is_ready_and_its_output_is_logged() {
     let mut robot = Robot::start("", &[]);
     let mut other = robot.other();
     let me = other.who();
@@ -126,7 +126,7 @@ fn program_is_ready_when_it_calls_ready() {
 }
 
 #[test]
-fn crashed_program_is_replaced_and_keeps_its_address_and_waiting_messages() {
+fn crashed_program_is_replaced_behind_the_same_address() {
     let mut robot = Robot::start("backoff_min_ms = 2000\n", &[]);
     let mut other = robot.other();
     let first = other.who();
@@ -196,7 +196,7 @@ fn death_at_each_start_ends_the_node_with_reason() {
 }
 
 #[test]
-fn program_that_does_not_register_is_killed_and_started_again() {
+fn unregistered_program_is_killed_and_started_again() {
     let mut robot = Robot::start(&format!("{RESTARTS}---\nstart_ms = 500\n"), &["--never-registers"]);
     for _ in 0..2 {
         let line = robot.node.wait_for(&["program ", " of drive started"]);
@@ -220,7 +220,7 @@ fn stray_process_cannot_take_the_name() {
 }
 
 #[test]
-fn stop_ends_the_program_and_what_it_has_started() {
+fn stop_ends_the_program_and_its_descendants() {
     let mut robot = Robot::start("", &[]);
     let mut other = robot.other();
     let program = Watched::new(other.who().pid);

@@ -57,7 +57,7 @@ pub(crate) fn claim_command(
     } else {
         registry.declare_kinds(app, &request.kinds, limits(state))
     };
-    declared.inspect_err(|_| drop(port.release(id)))?;
+    declared.inspect_err(|_| _ = port.release(id))?;
     notify_handled(state, app, request.kinds.iter().map(|name| Kind::named(name)).collect());
     Ok(app)
 }

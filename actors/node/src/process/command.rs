@@ -70,10 +70,7 @@ impl Command {
             progress_within: policy.progress_within,
             predecessor: Arc::default(),
         });
-        Arc::new(move |ready| {
-            let stop = Rc::new(Notify::new());
-            Box::new(CommandSupervision { run: Box::pin(run(command.clone(), ready, stop.clone())), stop })
-        })
+        Arc::new(move |ready| supervise(command.clone(), ready))
     }
 
     /// Starts the process after the former one has ended.
@@ -81,6 +78,12 @@ impl Command {
         let variable = variable(&self.state, &self.name);
         spawn::start_next(Role::Command, variable, &self.predecessor, &self.name).await
     }
+}
+
+/// Returns one process of the command, for its supervisor.
+fn supervise(command: Arc<Command>, ready: ReadyGate) -> Box<dyn RunningActor> {
+    let stop = Rc::new(Notify::new());
+    Box::new(CommandSupervision { run: Box::pin(run(command, ready, stop.clone())), stop })
 }
 
 struct CommandSupervision {
