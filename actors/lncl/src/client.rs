@@ -393,13 +393,13 @@ impl Client {
             let mut sent = Sent::default();
             match reader.receive(&self.peer.stream).await {
                 Ok(Received::Frame(message)) => {
-                    if let Some(port) = &self.command {
-                        port.count_frame();
-                    }
                     sent = self.sent(&message);
                     let order = session.handle(message);
                     if let ControlFlow::Break(end) = self.execute_session(session, order) {
                         return end;
+                    }
+                    if let Some(port) = &self.command {
+                        port.on_frame();
                     }
                     self.outcomes.wait_for_room().await;
                     self.orders.wait_for_turn().await;

@@ -228,9 +228,10 @@ impl CommandPort {
         self.clear_holder(&mut lock(&self.state));
     }
 
-    /// Counts a frame of the program: a sign of life.
-    pub(crate) fn count_frame(&self) {
+    /// Counts a frame of the program: a sign of life. An outcome makes room for a further confirmed message.
+    pub(crate) fn on_frame(&self) {
         self.frames.fetch_add(1, Ordering::Relaxed);
+        self.hand_over();
     }
 
     /// Returns the signs of life of the registered process, or `None` if none is registered.

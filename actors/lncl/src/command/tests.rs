@@ -115,7 +115,7 @@ fn program_is_probed_and_its_frames_are_signs_of_life() {
     port.open(KNEE, queue.clone());
     let before = port.signs().unwrap();
     port.probe(own);
-    port.count_frame();
+    port.on_frame();
     let after = port.signs().unwrap();
     assert_eq!((after.frames, after.reading.mark), (before.frames + 1, (1, 0)));
 }
