@@ -5,7 +5,10 @@ use std::{path::PathBuf, sync::Arc, time::Duration};
 use actix::Actor;
 
 use super::AppSpec;
-use crate::{app::AppContext, supervision::Place};
+use crate::{
+    app::{AppContext, RequirementPolicy},
+    supervision::Place,
+};
 
 /// Maximum number of words of a command: the program and its arguments.
 pub const COMMAND_WORDS_MAX: usize = 64;
@@ -112,7 +115,7 @@ impl AppSpec<Program> {
 
 impl CommandLine {
     /// Returns the error in this declaration, as a text, if it has one.
-    pub(super) fn fault(&self, place: &Place) -> Option<String> {
+    pub(super) fn fault(&self, place: &Place, on_lost: RequirementPolicy) -> Option<String> {
         let Self { words, folder, .. } = self;
         if words.first().is_none_or(String::is_empty) {
             return Some("its command names no program; write it as the first word".to_owned());
@@ -126,6 +129,10 @@ impl CommandLine {
         let folder = folder.iter().map(|folder| folder.as_os_str().as_encoded_bytes());
         if words.iter().map(String::as_bytes).chain(folder).any(|bytes| bytes.contains(&0)) {
             return Some("its command has a zero byte, which no argument can have; remove it".to_owned());
+        }
+        if on_lost != RequirementPolicy::CarryOn {
+            let why = "it is a command, whose program handles the loss of a requirement itself; remove that policy, and let it get `RequirementEvent`";
+            return Some(why.to_owned());
         }
         let is_placed = !place.own_process || place.realtime_priority.is_some() || place.cpu.is_some();
         is_placed.then(|| {
@@ -155,6 +162,7 @@ mod tests {
             (AppSpec::command("knee", ["x"; COMMAND_WORDS_MAX + 1]), "65 words"),
             (AppSpec::command("knee", ["python3", "a\0b"]), "zero byte"),
             (knee().folder("a\0b"), "zero byte"),
+            (knee().on_requirement_lost(RequirementPolicy::Restart), "RequirementEvent"),
             (knee().own_thread(), "remove its place"),
             (knee().place(Place::process().on_cpu(1)), "remove its place"),
         ];

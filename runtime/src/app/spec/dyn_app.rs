@@ -120,7 +120,7 @@ impl DynApp {
         if let Some(why) = contract::fault(self.name(), contracts) {
             return Some(why);
         }
-        if let Some(why) = self.command().and_then(|line| line.fault(self.place())) {
+        if let Some(why) = self.command().and_then(|line| line.fault(self.place(), *on_lost)) {
             return Some(why);
         }
         match on_lost {
