@@ -71,7 +71,7 @@ impl<'t> Reader<'t> {
     pub(super) fn add_keys(&mut self, section: &'static str, table: &'t DeTable<'t>, known: &[&'static str]) {
         for (name, value) in table {
             let full = format!("{section}.{}", name.get_ref());
-            match known.iter().find(|key| **key == *full) {
+            match known.iter().copied().find(|key| *key == full) {
                 Some(key) => {
                     self.values.insert(key, value);
                 }
