@@ -219,8 +219,9 @@ impl Child {
     }
 
     fn check_progress(&mut self, now: Instant) -> Option<Reason> {
-        // A program that is told to stop need not read any more.
-        let signs = self.command.port.signs().filter(|_| !self.is_stopping);
+        // A program that is not ready has another deadline, and so has one that is told to stop.
+        let is_watched = self.ready.is_none() && !self.is_stopping;
+        let signs = self.command.port.signs().filter(|_| is_watched);
         match self.progress.check(now, signs) {
             Verdict::Alive => {}
             Verdict::Idle => self.command.port.probe(self.command.tid),

@@ -68,7 +68,7 @@ pub(super) const COMMAND_ROWS: &[Row] = &[
             CommandReadiness::Called => json!("called"),
         },
         effect: "Whether the application is ready when its program has registered, or when it has called `ready` as well.",
-        note: "",
+        note: "Clients in Rust and Python have this call. `hang_ms` counts from the readiness on.",
     },
     Row {
         key: "command.while_down",
