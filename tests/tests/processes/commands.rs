@@ -133,9 +133,11 @@ fn crashed_program_is_replaced_behind_the_same_address() {
     assert_eq!(other.order_confirmed(&Order::Exit(3)), Outcome::Failed);
     robot.node.wait_for(&["a child failed", "its process ended: exit code 3"]);
     (1..=20).for_each(|number| other.count(number));
+    // Behind them: it has their class.
+    assert_eq!(other.count_confirmed(21), Outcome::Delivered);
     let second = other.who();
     assert_ne!(second.pid, first.pid);
-    assert_eq!(second.counts, (1..=20).collect::<Vec<_>>());
+    assert_eq!(second.counts, (1..=21).collect::<Vec<_>>());
     let drive = other.endpoint.resolve("drive", DEADLINE).expect("the node answers");
     assert_eq!(drive, Some(other.drive));
 }
