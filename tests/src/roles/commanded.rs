@@ -7,11 +7,14 @@
 
 use std::{path::Path, process::ExitCode, time::Duration};
 
-use rustix::process::{Signal, getpid, kill_process};
+use rustix::process::Signal;
 use sinew::{Endpoint, Node, NodeApi, NodeConfig, Outcome, Payload, Registration, client::Received};
 use sinew_testkit::{DEADLINE, until};
 
-use super::Options;
+use super::{
+    Options,
+    process_under_test::{signal_myself, start_a_sleeper},
+};
 use crate::orders::{Count, Me, Order, Who};
 
 fn print_line(what: &str) {
@@ -60,10 +63,13 @@ pub(super) fn run_program(arguments: &[String]) -> ExitCode {
                 let me = Me { pid: std::process::id(), counts: counts.clone() };
                 endpoint.reply(&received, &me).expect("the node runs");
             }
-            Order::KIND => match received.decode().expect("it is one") {
-                Order::Stop => return stop(endpoint, received),
-                order => execute(&order),
-            },
+            Order::KIND => {
+                let order = received.decode().expect("it is one");
+                if matches!(order, Order::Stop) {
+                    return stop(endpoint, received);
+                }
+                execute(&order);
+            }
             _ => received.settle(Outcome::Failed),
         }
     }
@@ -77,16 +83,16 @@ fn stop(endpoint: Endpoint, received: Received) -> ExitCode {
 }
 
 fn execute(order: &Order) {
-    match order {
-        Order::Exit(code) => std::process::exit(*code),
-        Order::Kill => kill_process(getpid(), Signal::KILL).expect("it is this process"),
-        Order::Hang => loop {
-            std::thread::sleep(Duration::from_secs(60));
-        },
-        Order::StartASleeper(_) => {
-            let sleeper = std::process::Command::new("sleep").arg("120").spawn();
-            print_line(&format!("sleeper {}", sleeper.expect("every system has it").id()));
-        }
-        other => panic!("{other:?} is for another application"),
+    if let Order::Exit(code) = order {
+        std::process::exit(*code);
+    }
+    if matches!(order, Order::Kill) {
+        signal_myself(Signal::KILL);
+    }
+    while matches!(order, Order::Hang) {
+        std::thread::sleep(Duration::from_secs(60));
+    }
+    if let Order::StartASleeper(in_own_group) = order {
+        start_a_sleeper(*in_own_group);
     }
 }

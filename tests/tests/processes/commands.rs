@@ -71,10 +71,9 @@ impl Robot {
     /// Tries to take the name of the drive. Returns the reason of the refusal.
     fn refusal(&self) -> String {
         let refused = self.api().register_transport_address(Registration::new().name("drive"));
-        match refused.expect_err("the name is not for this process") {
-            ApiError::Refused(why) => why,
-            error => panic!("{error}"),
-        }
+        let error = refused.expect_err("the name is not for this process");
+        let ApiError::Refused(why) = error else { panic!("{error}") };
+        why
     }
 }
 
