@@ -64,7 +64,7 @@ pub(super) fn run_program(arguments: &[String]) -> ExitCode {
                 endpoint.reply(&received, &me).expect("the node runs");
             }
             Order::KIND => {
-                let order = received.decode().expect("it is one");
+                let order: Order = received.decode().expect("it is one");
                 if matches!(order, Order::Stop) {
                     return stop(endpoint, received);
                 }
