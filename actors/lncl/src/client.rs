@@ -140,7 +140,7 @@ struct Client {
     outcomes: Arc<Outcomes>,
     /// Its pending requests on its groups.
     orders: Orders,
-    /// The command whose name it has, if the node has started it for one.
+    /// Its command, if the node has started its process for one.
     command: Option<Arc<CommandPort>>,
     /// Set while messages flow.
     link: Option<LinkNumber>,

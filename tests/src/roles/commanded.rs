@@ -2,8 +2,8 @@
 //!
 //! `command_node CONFIG.toml` is a node without applications but the commands of its file.
 //!
-//! `commanded [--dies-at-start CODE] [--never-registers] [--ready-when FILE]` is a program for such a file. It registers
-//! the name of its command, and follows orders.
+//! `commanded [--dies-at-start CODE] [--never-registers] [--ready-when FILE]` is a program for such a file. It
+//! registers the name of its command, and follows orders.
 
 use std::{path::Path, process::ExitCode, time::Duration};
 

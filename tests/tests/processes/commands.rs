@@ -35,7 +35,7 @@ fn list(words: &[&str]) -> String {
 }
 
 impl Robot {
-    /// Starts the node with `more` in its command, whose program has these arguments.
+    /// Starts the node with `more` in its command. The program has these arguments.
     fn start(more: &str, arguments: &[&str]) -> Self {
         let scenarios = program("scenarios");
         let scenarios = scenarios.to_str().expect("its path is text");

@@ -9,7 +9,7 @@ use crate::{ApiError, wait_mode::block_ready};
 
 impl Endpoint {
     /// Reports to the node that this program is ready. Has an effect only if the node has started the program as a
-    /// command whose readiness is `Called`; all other programs are ready when they have registered.
+    /// command with the readiness `Called`; all other programs are ready when they have registered.
     ///
     /// # Errors
     /// The node does not accept the message.

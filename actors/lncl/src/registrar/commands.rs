@@ -21,7 +21,7 @@ use super::{
 };
 use crate::State;
 
-/// Registers a command of the node, whose sink is `port`. The processes that the node starts for it connect as clients
+/// Registers a command of the node with the sink `port`. The processes that the node starts for it connect as clients
 /// later; until then its messages wait.
 ///
 /// # Errors

@@ -6,7 +6,7 @@ use sinew_runtime::{mailbox::Mailbox, outcome::Ticket};
 use super::*;
 use crate::{CommandPort, LocalApp, Presence, register_command};
 
-/// Registers the command `knee`, whose program has to call `ready`.
+/// Registers the command `knee`. Its program has to call `ready`.
 fn command(node: &TestNode) -> (Arc<CommandPort>, Tid) {
     let port = CommandPort::new("knee", Mailbox::new(8), true);
     let app = LocalApp {

@@ -1,5 +1,5 @@
-//! The supervised process of a command: started, watched, stopped, killed. It registers its name at the node's socket by
-//! itself.
+//! The supervised process of a command: started, watched, stopped, killed. It registers its name at the node's
+//! socket by itself.
 
 mod launch;
 mod output;

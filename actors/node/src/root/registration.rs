@@ -81,8 +81,7 @@ impl Root {
     ) -> Result<Option<(Arc<CommandPort>, CommandReadiness)>, StartError> {
         let Some(line) = app.command() else { return Ok(None) };
         if self.state.ctx.config.lncl.socket.is_none() {
-            let why =
-                "it is a command, whose program joins at the node's socket; set `lncl.socket`".to_owned();
+            let why = "it is a command: its program joins at the node's socket; set `lncl.socket`".to_owned();
             return Err(StartError::Application { name: app.name().to_owned(), why });
         }
         let awaits_ready = line.readiness == CommandReadiness::Called;

@@ -81,7 +81,9 @@ impl AppSpec<Program> {
     /// let knee = AppSpec::command("knee.drive", ["python3", "knee.py"])
     ///     .requires(["knee.imu"])
     ///     .progress_within(Duration::from_millis(200));
-    /// let node = Node::builder("knee").configure(|config| config.lncl.socket = Some("/run/sinew/knee.sock".into())).app(knee);
+    /// let node = Node::builder("knee")
+    ///     .configure(|config| config.lncl.socket = Some("/run/sinew/knee.sock".into()))
+    ///     .app(knee);
     /// ```
     pub fn command<W: Into<String>>(name: impl Into<String>, words: impl IntoIterator<Item = W>) -> Self {
         let no_actor = || Err("it is a command, which only a node can start".to_owned());
@@ -131,12 +133,12 @@ impl CommandLine {
             return Some("its command has a zero byte, which no argument can have; remove it".to_owned());
         }
         if on_lost != RequirementPolicy::CarryOn {
-            let why = "it is a command, whose program handles the loss of a requirement itself; remove that policy, and let it get `RequirementEvent`";
+            let why = "it is a command: its program handles the loss of a requirement itself; remove that policy, and let it get `RequirementEvent`";
             return Some(why.to_owned());
         }
         let is_placed = !place.own_process || place.realtime_priority.is_some() || place.cpu.is_some();
         is_placed.then(|| {
-            "it is a command, whose program sets its threads itself (`chrt`, `taskset`); remove its place"
+            "it is a command: its program sets its threads itself (`chrt`, `taskset`); remove its place"
                 .to_owned()
         })
     }

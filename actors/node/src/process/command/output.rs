@@ -1,7 +1,7 @@
 //! The standard output and the standard error of a command, as lines of the node's log.
 //!
-//! Lines are bounded in length and rate. Bytes beyond the rate stay in the pipe, so that a flood slows the program and not
-//! the node.
+//! Lines are bounded in length and rate. Bytes beyond the rate stay in the pipe, so that a flood slows the program
+//! and not the node.
 
 use std::{future::pending, io, time::Duration};
 
@@ -137,8 +137,8 @@ impl LineQuota {
         Self { limiter: RateLimiter::new(Rate::new(LINE_EACH, LINES_AT_ONCE)), dropped: 0 }
     }
 
-    /// Returns the number of lines dropped since the last one if one more may be written at `now`. `None`: it must not be
-    /// written, and is counted.
+    /// Returns the number of lines dropped since the last one if one more may be written at `now`. `None`: it must not
+    /// be written, and is counted.
     fn take(&mut self, now: Time) -> Option<u64> {
         if self.limiter.try_take(now) {
             return Some(std::mem::take(&mut self.dropped));
