@@ -17,6 +17,16 @@ const STOP_WITHIN: Duration = Duration::from_secs(2);
 
 /// The actor type of an application that is a [command](AppSpec::command). It has no values: the messages go to the
 /// program.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::{app::Program, prelude::*};
+///
+/// fn python(name: &str, file: &str) -> AppSpec<Program> {
+///     AppSpec::command(name, ["python3", "-u", file]).while_down(DownPolicy::Drop)
+/// }
+/// ```
 #[derive(Debug)]
 pub enum Program {}
 
@@ -97,6 +107,14 @@ impl AppSpec<Program> {
     }
 
     /// Sets the working directory of the program. Default: that of the node.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::prelude::*;
+    ///
+    /// let knee = AppSpec::command("knee.drive", ["./knee"]).folder("/opt/knee");
+    /// ```
     #[must_use]
     pub fn folder(mut self, folder: impl Into<PathBuf>) -> Self {
         if let Some(line) = &mut self.common.command {
