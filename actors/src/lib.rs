@@ -13,6 +13,7 @@
 //! | a node: start, stop, status | [`Node`], [`NodeBuilder`], [`node`], [`config`] |
 //! | an application in the node's process | [`AppSpec`], [`AppContext`], [`Delivery`], [`payload!`], [`app`] |
 //! | the same in a process of its own, started and restarted by the node | [`AppSpec::own_process`], [`supervision::Place`] |
+//! | an application that is any program, started and restarted by the node | [`AppSpec::command`] |
 //! | an application in a process that the node did not start | [`client`]: [`NodeApi`], [`Endpoint`] for a thread, [`AsyncEndpoint`] for a task |
 //! | values that are tuned while an application runs | [`params!`], [`parameters`] |
 //! | sending, and outcomes | [`message`], [`Outcome`] |
@@ -96,8 +97,8 @@ pub mod address {
 /// Applications: how to declare one, the context of each message, and the calls available in it.
 pub mod app {
     pub use sinew_runtime::app::{
-        AppContext, AppSpec, Delivery, DownPolicy, GroupOutcome, LastWill, Raw, Requirement,
-        RequirementPolicy, SendOutcome,
+        AppContext, AppSpec, COMMAND_WORDS_MAX, CommandReadiness, Delivery, DownPolicy, GroupOutcome,
+        LastWill, Program, Raw, Requirement, RequirementPolicy, SendOutcome,
     };
 }
 
@@ -117,8 +118,8 @@ pub mod barrier {
 pub mod config {
     #[doc(inline)]
     pub use sinew_model::config::{
-        AppSettings, ConfigError, ConfigFault, ContractsConfig, Families, GnclConfig, Interface,
-        InterfaceError, Interfaces, LnclConfig, LogConfig, LogLevel, NdlConfig, NodeConfig,
+        AppSettings, CommandConfig, ConfigError, ConfigFault, ContractsConfig, Families, GnclConfig,
+        Interface, InterfaceError, Interfaces, LnclConfig, LogConfig, LogLevel, NdlConfig, NodeConfig,
         RecordCompression, RecordConfig, RtConfig, SecurityConfig, Seed, SeedError, StopConfig,
         SupervisionConfig, SyncConfig, TimePolicy, WatchGroup,
     };

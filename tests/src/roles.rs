@@ -1,5 +1,6 @@
 //! The roles of processes: the program of the scenarios starts itself again with `--role NAME`.
 
+mod commanded;
 mod node_under_test;
 mod process_under_test;
 mod unread_log;
@@ -36,6 +37,8 @@ pub fn run() -> Option<ExitCode> {
         return None;
     }
     match &**role {
+        "command_node" => return Some(commanded::run_node(arguments)),
+        "commanded" => return Some(commanded::run_program(arguments)),
         "node_under_test" => return Some(node_under_test::run(arguments)),
         "process_under_test" => return Some(process_under_test::run(arguments)),
         "unread_log" => return Some(unread_log::run(arguments)),

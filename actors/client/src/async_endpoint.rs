@@ -235,6 +235,14 @@ impl AsyncEndpoint {
         self.endpoint.look_up(name, within).await
     }
 
+    /// Reports to the node that this program is ready, like [`Endpoint::ready`].
+    ///
+    /// # Errors
+    /// The node does not accept the message.
+    pub async fn ready(&mut self) -> Result<(), ApiError> {
+        self.endpoint.send_ready().await
+    }
+
     /// Releases the address and waits for the node's confirmation: the name is free when this returns.
     ///
     /// # Errors

@@ -2,6 +2,7 @@
 
 mod groups;
 mod names;
+mod ready;
 mod unregister;
 
 use std::{path::Path, pin::pin, time::Duration};
@@ -83,6 +84,8 @@ pub struct Endpoint {
     /// Time of the last request for names similar to an unknown one.
     pub(super) nearest_asked: Option<Time>,
     pub(super) leaves: Leaves,
+    /// Whether the node supervises this program, and waits for [`ready`](Self::ready).
+    pub(super) awaits_ready: bool,
 }
 
 impl std::fmt::Debug for Endpoint {
@@ -106,7 +109,7 @@ impl Endpoint {
             registration;
         let Link { registered, writer, reader } = link;
         let terms = Terms::of(&registered, &options, &writer);
-        let Registered { node: address, app, node_name, payload_max, ring: _, types: _ } = registered;
+        let Registered { node: address, app, node_name, payload_max, ring: _, types: _, ready } = registered;
         let control = reader.control().filter(|_| options.direct_links.accepts());
         let inbox = Inbox::new(Tid::new(address, app), inbox_capacity, payload_max as usize, writer.clone());
         register.former = Some(app);
@@ -126,6 +129,7 @@ impl Endpoint {
             ends: Ends::new(Time::now()),
             nearest_asked: None,
             leaves: Leaves::default(),
+            awaits_ready: ready,
         }
     }
 

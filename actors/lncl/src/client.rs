@@ -7,10 +7,10 @@ mod memberships;
 mod orders;
 mod outcomes;
 mod sink;
+mod writing;
 
-use std::{io::ErrorKind, ops::ControlFlow, rc::Rc, sync::Arc, time::Duration};
+use std::{future::poll_fn, io, ops::ControlFlow, pin::pin, rc::Rc, sync::Arc, time::Duration};
 
-use bytes::{Buf, BytesMut};
 use rustix::net::Shutdown;
 use sinew_model::{cause::Cause, facts::User};
 use sinew_protocol::payload::{self, REGISTER_BYTES_MAX, Register, Registered};
@@ -20,7 +20,7 @@ use sinew_runtime::{
     router::{LocalRoute, MessageSink, Reach},
     tid::Tid,
     time::Time,
-    wire::{Kind, Message, encode_frame},
+    wire::{Kind, Message},
 };
 use sinew_security::access::Applicant;
 use sinew_session::{
@@ -35,8 +35,10 @@ use self::{
     memberships::Orders,
     outcomes::Outcomes,
     sink::ClientSink,
+    writing::{encoded, write_soon},
 };
 use super::{
+    command::{CommandPort, HandOver},
     core::{Address, Owner, Request},
     guest_reads::Sent,
     link::{self, ClientReader, ClientSocket, RingHalf},
@@ -138,6 +140,8 @@ struct Client {
     outcomes: Arc<Outcomes>,
     /// Its pending requests on its groups.
     orders: Orders,
+    /// Its command, if the node has started its process for one.
+    command: Option<Arc<CommandPort>>,
     /// Set while messages flow.
     link: Option<LinkNumber>,
     tid: Tid,
@@ -181,7 +185,11 @@ impl Client {
         let (owner, user) = (peer.owner(), User::of(uid, own));
         let request = Request { address, name, requires: requires.clone(), kinds, owner, user };
         let called = request.name.clone();
-        let app = registrar::register_client(&server.state, request)?;
+        let command = called.as_deref().and_then(|name| server.state.commands.named(name));
+        let app = match &command {
+            Some(port) => registrar::claim_command(&server.state, port, (peer.id, peer.pid), &request)?,
+            None => registrar::register_client(&server.state, request)?,
+        };
         if let Some(access) = server.state.security.access.get() {
             access.holds(app, uid, called.as_deref());
         }
@@ -206,13 +214,15 @@ impl Client {
         let (link, events, is_notified) = (None, events.into(), false);
         let cause = Cause::new(DownClass::Killed, registrar::LNCL_ENDED);
         let ring = if ring { Ring::Supported } else { Ring::None };
-        let (wants_links, departure) = (direct, Departure::LinksRemain);
+        // All messages of a command pass the node, which keeps them when its process ends.
+        let (wants_links, departure) = (direct && command.is_none(), Departure::LinksRemain);
         Ok(Self {
             server,
             peer,
             outlet,
             outcomes,
             orders: Orders::default(),
+            command,
             link,
             tid,
             user,
@@ -277,22 +287,44 @@ impl Client {
         }
         let checks = self.server.state.ctx.checks.clone();
         let sink = Arc::new(ClientSink::new(self.outlet.clone(), checks));
-        let route = LocalRoute { sink, events: self.events.clone() };
-        registrar::open(&self.server.state, self.tid.app, route);
+        if self.command.is_none() {
+            let route = LocalRoute { sink: sink.clone(), events: self.events.clone() };
+            registrar::open(&self.server.state, self.tid.app, route);
+        }
         let (mut reader, link) = match self.open_link(reader).await {
             Ok(opened) => opened,
             Err(end) => return end,
         };
         self.link = Some(link);
+        if let Some(port) = &self.command {
+            // Only now: a message that is handed over before the connection carries it would be lost with it.
+            let queue: Arc<dyn HandOver> = sink;
+            let to = (port, self.tid.app);
+            registrar::open_command(&self.server.state, to, self.peer.id, (queue, self.events.clone()));
+        }
         let receive = self.receive(&mut reader, session);
         tokio::pin!(receive);
         tokio::select! {
             end = &mut receive => end,
             // Frames that the client sent before its end have arrived, and are still handled.
-            cause = self.outlet.drain(link) => {
+            cause = self.drain(link) => {
                 tokio::time::timeout(REFUSAL_TIMEOUT, receive).await.unwrap_or_else(|_| ConnectionEnd::of_write(cause))
             }
         }
+    }
+
+    /// Writes queued messages whenever the connection has room. Resolves when it cannot be written to any more.
+    async fn drain(&self, link: LinkNumber) -> io::Error {
+        let mut drain = pin!(self.outlet.drain(link));
+        poll_fn(|cx| {
+            let drained = drain.as_mut().poll(cx);
+            if let Some(port) = &self.command {
+                // There may be room now for messages that wait in the node.
+                port.hand_over();
+            }
+            drained
+        })
+        .await
     }
 
     /// Notifies the client of its address, and agrees with it on the transport of messages.
@@ -366,6 +398,9 @@ impl Client {
                     if let ControlFlow::Break(end) = self.execute_session(session, order) {
                         return end;
                     }
+                    if let Some(port) = &self.command {
+                        port.on_frame();
+                    }
                     self.outcomes.wait_for_room().await;
                     self.orders.wait_for_turn().await;
                 }
@@ -403,48 +438,11 @@ impl Client {
         let payload_max = u32::try_from(config.payload_max).unwrap_or(u32::MAX);
         let Tid { node, app } = self.tid;
         let types = self.server.state.ctx.ports.app_types().is_some();
-        let registered = Registered { node, app, node_name: config.name.clone(), payload_max, ring, types };
+        let node_name = config.name.clone();
+        let ready = self.command.as_ref().is_some_and(|port| port.awaits_ready());
+        let registered = Registered { node, app, node_name, payload_max, ring, types, ready };
         payload::frame(Kind::LNCL_REGISTERED, payload::lncl_of(node), self.tid, &registered)
     }
-}
-
-fn encoded(message: &Message) -> BytesMut {
-    let mut bytes = BytesMut::new();
-    encode_frame(&message.header, &message.payload, &mut bytes);
-    bytes
-}
-
-/// Writes the final frame, if the socket has room for it.
-fn write_now(stream: &UnixStream, message: &Message) -> Result<(), ConnectionEnd> {
-    let mut bytes = encoded(message);
-    write_some(stream, &mut bytes)?;
-    if bytes.is_empty() { Ok(()) } else { Err(ConnectionEnd::HungUp(None)) }
-}
-
-/// Writes as much as the socket takes now; the rest remains in `bytes`.
-fn write_some(stream: &UnixStream, bytes: &mut BytesMut) -> Result<(), ConnectionEnd> {
-    while !bytes.is_empty() {
-        match stream.try_write(bytes) {
-            Ok(count) => bytes.advance(count),
-            Err(cause) if cause.kind() == ErrorKind::WouldBlock => break,
-            Err(cause) => return Err(ConnectionEnd::HungUp(Some(cause))),
-        }
-    }
-    Ok(())
-}
-
-/// Writes all of `bytes`. The peer has [`HANDSHAKE`] to read them.
-async fn write_soon(stream: &UnixStream, mut bytes: BytesMut) -> Result<(), ConnectionEnd> {
-    let write = async {
-        loop {
-            write_some(stream, &mut bytes)?;
-            if bytes.is_empty() {
-                return Ok(());
-            }
-            stream.writable().await.map_err(|cause| ConnectionEnd::HungUp(Some(cause)))?;
-        }
-    };
-    tokio::time::timeout(HANDSHAKE, write).await.unwrap_or(Err(ConnectionEnd::HungUp(None)))
 }
 
 fn limits(state: &State) -> OutletLimits {
@@ -454,37 +452,5 @@ fn limits(state: &State) -> OutletLimits {
         queue_bytes: config.mailbox_bytes,
         unconfirmed_max: config.mailbox_capacity,
         payload_max: config.payload_max,
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use std::io::Read;
-
-    use super::*;
-
-    #[test]
-    fn frame_without_room_arrives_whole_when_the_peer_reads() {
-        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().expect("a runtime");
-        runtime.block_on(async {
-            // Given: a peer that does not read, and more data than its socket holds.
-            let (ours, mut theirs) = std::os::unix::net::UnixStream::pair().expect("a pair");
-            ours.set_nonblocking(true).expect("it is ours");
-            let ours = UnixStream::from_std(ours).expect("it is a socket");
-            let whole: Vec<u8> = (0..2_000_000_u32).map(|index| (index % 251) as u8).collect();
-            let mut rest = BytesMut::from(&whole[..]);
-            ours.writable().await.expect("it takes something");
-            assert!(write_some(&ours, &mut rest).is_ok());
-            assert!(!rest.is_empty() && rest.len() < whole.len(), "{} bytes are left", rest.len());
-            // When: it reads.
-            let reading = std::thread::spawn(move || {
-                let mut read = Vec::new();
-                theirs.read_to_end(&mut read).map(|_| read)
-            });
-            assert!(write_soon(&ours, rest).await.is_ok());
-            drop(ours);
-            // Then:
-            assert!(reading.join().expect("no panic").expect("it reads") == whole);
-        });
     }
 }

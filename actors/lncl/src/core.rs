@@ -16,6 +16,7 @@ use sinew_runtime::{
 use sinew_session::book::ClientId;
 
 use self::kinds::Kinds;
+use crate::command::ClaimError;
 
 /// Maximum number of requirements of one application, and of the payload types that it names.
 pub(crate) const NAMES_MAX: usize = 64;
@@ -49,6 +50,8 @@ impl Limits {
 pub enum Owner {
     /// The node's own process.
     Node,
+    /// A command of the node: the processes that it starts for it register its name.
+    Command,
     /// A connection of the process `pid`; 0 if the kernel does not report it, as for a process of another PID
     /// namespace.
     Client { id: ClientId, pid: i32 },
@@ -58,6 +61,7 @@ impl fmt::Display for Owner {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Node => f.write_str("the node's own process"),
+            Self::Command => f.write_str("a command of the node"),
             Self::Client { pid: 0, .. } => f.write_str("a process of another PID namespace"),
             Self::Client { pid, .. } => write!(f, "process {pid}"),
         }
@@ -121,6 +125,14 @@ pub enum RegisterError {
     /// The node's access list does not let this user register so.
     #[error("{0}")]
     NotAllowed(String),
+    /// The name is that of a command of the node.
+    #[error("the name '{name}' belongs to a command of this node: {why}")]
+    Command {
+        /// The name.
+        name: String,
+        /// Why this process does not get it.
+        why: ClaimError,
+    },
     /// Another application of the node has this address.
     #[error(
         "address {address} is taken by {holder} of {owner}; choose another address or end that one first"
@@ -253,6 +265,23 @@ impl Registry {
         Ok(app)
     }
 
+    /// Adds the names of payload types that the process of a command uses.
+    ///
+    /// # Errors
+    /// The reason; nothing changed.
+    pub fn declare_kinds(
+        &mut self,
+        app: AppAddress,
+        names: &[String],
+        limits: Limits,
+    ) -> Result<(), RegisterError> {
+        check_length("payload types", names)?;
+        names.iter().try_for_each(|name| check_spelling(name))?;
+        let kinds = self.kinds.check(User::Own, names)?;
+        self.kinds.claim(User::Own, app, kinds, limits.apps);
+        Ok(())
+    }
+
     /// Removes an application. Returns whether it was registered.
     pub fn unregister(&mut self, app: AppAddress) -> bool {
         let Some(entry) = self.apps.remove(&app) else { return false };
@@ -274,7 +303,7 @@ impl Registry {
 
     /// Returns the applications in other processes.
     pub fn in_other_processes(&self) -> Vec<AppAddress> {
-        self.owned_by(|owner| owner != Owner::Node)
+        self.owned_by(|owner| matches!(owner, Owner::Client { .. }))
     }
 
     /// Returns the id of a new connection.
@@ -434,12 +463,14 @@ fn check_spelling(name: &str) -> Result<(), RegisterError> {
     check_name(name).map_err(|why| RegisterError::BadName { name: beginning(), why })
 }
 
+fn check_length(what: &'static str, list: &[String]) -> Result<(), RegisterError> {
+    let found = list.len();
+    if found > NAMES_MAX { Err(RegisterError::TooMany { what, found, limit: NAMES_MAX }) } else { Ok(()) }
+}
+
 fn check_lists(request: &Request) -> Result<(), RegisterError> {
-    for (what, list) in [("requirements", &request.requires), ("payload types", &request.kinds)] {
-        if list.len() > NAMES_MAX {
-            return Err(RegisterError::TooMany { what, found: list.len(), limit: NAMES_MAX });
-        }
-    }
+    check_length("requirements", &request.requires)?;
+    check_length("payload types", &request.kinds)?;
     request.kinds.iter().try_for_each(|name| check_spelling(name))?;
     request.requires.iter().try_for_each(|text| text.parse::<Requirement>().map(drop))?;
     Ok(())

@@ -122,6 +122,7 @@ fn converse(bytes: &[u8], pieces: usize) -> bool {
                 | Order::Introduce { .. }
                 | Order::Switch { .. }
                 | Order::DeclareType(_)
+                | Order::Ready
                 | Order::Observe(_) => assert!(is_registered && source == CLIENT),
             }
         }

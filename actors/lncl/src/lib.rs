@@ -24,6 +24,7 @@
 //! | LNCL-17 | A client with a direct link to a process that has ended is notified, even while a child of that process holds the link's end. |
 //! | LNCL-20 | While an application with direct links is watched, its client reports the messages on them; a report never delays a message. |
 //! | LNCL-21 | A client may declare the structures of its types, for comparisons with those of other applications. A declaration without room, or of invalid bytes, is counted and ignored. |
+//! | LNCL-22 | The name of a command of the node is given only to processes in the process group that the node started for it. |
 
 #![allow(
     missing_docs,
@@ -34,6 +35,7 @@
 mod actor;
 mod client;
 mod client_socket;
+mod command;
 mod core;
 mod descriptors;
 #[cfg(feature = "fuzzing")]
@@ -66,13 +68,14 @@ mod worker;
 
 pub use actor::Lncl;
 pub use client_socket::ClientSocket;
+pub use command::{ClaimError, CommandPort, Commands, Presence, Reading, Signs};
 pub use core::RegisterError;
 pub use core::{Owner, Registry};
 pub use listener::{ListenError, SocketAccess};
 pub use reader::Reader;
 pub use registrar::{
-    LocalApp, app_down, app_ready, app_stopped, nearest, register_local, resolve, set_member, types_known,
-    unregister_local,
+    LocalApp, app_down, app_ready, app_stopped, nearest, register_command, register_local, resolve,
+    set_member, types_known, unregister_local,
 };
 pub use state::State;
 

@@ -2,6 +2,11 @@
 //!
 //! The registry's lock is held during all three updates, so that they see the changes of one address in one order.
 
+mod commands;
+
+pub use self::commands::register_command;
+pub(crate) use self::commands::{claim_command, open_command, release_command};
+
 use std::sync::Arc;
 
 use sinew_model::{
@@ -45,9 +50,13 @@ pub struct LocalApp {
 /// # Errors
 /// The reason; nothing changed.
 pub fn register_local(state: &State, app: LocalApp) -> Result<Tid, RegisterError> {
+    register_own(state, app, Owner::Node)
+}
+
+fn register_own(state: &State, app: LocalApp, owner: Owner) -> Result<Tid, RegisterError> {
     let LocalApp { name, address, requires, kinds, sink, events } = app;
     let address = address.map_or(Address::Dynamic, Address::Fixed);
-    let (owner, user) = (Owner::Node, User::Own);
+    let user = User::Own;
     let request = Request { address, name: name.clone(), requires, kinds, owner, user };
     let mut registry = lock(&state.registry);
     let fact_requires = request.requires.clone();
@@ -89,6 +98,9 @@ pub fn app_stopped(state: &State, app: AppAddress) {
 /// Removes the registration of an application.
 pub fn unregister_local(state: &State, app: AppAddress) {
     let mut registry = lock(&state.registry);
+    if let Some(name) = registry.own_name_of(app) {
+        state.commands.remove(&name);
+    }
     if registry.unregister(app) {
         // Its supervisor has reported the reason before. An application that never started has no end to report.
         remove(state, app, Cause::new(DownClass::Shutdown, "it is not run any more"));
@@ -207,6 +219,7 @@ pub(super) fn remove_owner(state: &State, owner: Owner, cause: &Cause) {
 /// Removes the clients of an earlier instance of LNCL's actor. Their connections ended with it.
 pub(super) fn remove_former_clients(state: &State) {
     let mut registry = lock(&state.registry);
+    state.commands.release_all();
     for app in registry.in_other_processes() {
         registry.unregister(app);
         remove(state, app, Cause::new(DownClass::Killed, LNCL_ENDED));

@@ -189,6 +189,7 @@ impl Server {
         for outlet in self.clients.borrow().values() {
             is_left |= outlet.expire(now);
         }
+        self.state.commands.hand_over();
         is_left |= self.state.observed_links.retry(&self.state.ctx.router);
         is_left | undelivered::report(&self.state, now)
     }

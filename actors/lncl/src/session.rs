@@ -56,6 +56,8 @@ pub enum Order {
     Switch { to: Tid, number: u64, correlation: u64 },
     /// Record the structure of a type of the client.
     DeclareType(TypeDeclaration),
+    /// Record that the program of a command is ready.
+    Ready,
     /// Report a message on a direct link of the client to the tap.
     Observe(Box<Observed>),
     /// Count a rejected message, and send the outcome if the client requested it. The connection continues.
@@ -166,6 +168,7 @@ impl Session {
             Kind::LNCL_SWITCH => read_switch(&message),
             Kind::LNCL_OBSERVED => read_observed(&message),
             Kind::LNCL_TYPE => read_payload(&message).map(Order::DeclareType),
+            Kind::LNCL_READY => Ok(Order::Ready),
             Kind::LNCL_UNREGISTER => Ok(Order::Unregister),
             Kind::LNCL_REGISTER => Err(ProtocolError::RegisteredTwice),
             // Not a Rust enum, but an open set of numbers.

@@ -16,7 +16,7 @@ use sinew_security::SecurityState;
 use sinew_session::book::Book;
 
 use super::{
-    ClientSocket, ListenError, Registry, SocketAccess, observed_links::ObservedLinks,
+    ClientSocket, Commands, ListenError, Registry, SocketAccess, observed_links::ObservedLinks,
     undelivered::Undelivered,
 };
 
@@ -30,6 +30,8 @@ pub struct State {
     pub client_socket: ClientSocket,
     /// The applications that are registered on this node.
     pub registry: Mutex<Registry>,
+    /// The commands that the node supervises.
+    pub commands: Commands,
     /// The quota of messages that guests (clients of other users) may have queued at the layers.
     pub guest_quotas: GuestQuotas,
     /// Unconfirmed messages that were refused without a report to their senders.
@@ -50,6 +52,7 @@ impl State {
             security,
             client_socket: ClientSocket::default(),
             registry: Mutex::new(Registry::counting_links_from(RandomState::new().hash_one(()))),
+            commands: Commands::default(),
             guest_quotas: GuestQuotas::default(),
             undelivered,
             observed_links: ObservedLinks::default(),

@@ -1,6 +1,7 @@
 //! A real socket with handwritten clients, as clients in other languages use it.
 
 mod access;
+mod commands;
 mod documented;
 mod forks;
 mod pending_outcomes;

@@ -80,6 +80,9 @@ pub struct Registered {
     /// Whether the node reads declarations of types. One of a former version does not.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub types: bool,
+    /// Whether the node waits for [`Kind::LNCL_READY`].
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub ready: bool,
 }
 
 /// Reason for a refused registration or for the end of a connection.

@@ -408,6 +408,12 @@ impl<S: Socket> SocketWriter<S> {
         self.lock().taking()
     }
 
+    /// Returns the number of written bytes that the peer has not taken; `None` if the socket cannot report them, or
+    /// without a connection.
+    pub fn unread(&self) -> Option<u64> {
+        self.lock().unread()
+    }
+
     /// Returns the number of messages that wait to be sent.
     pub fn waiting(&self) -> usize {
         let state = self.lock();

@@ -338,6 +338,16 @@ impl Core {
         })
     }
 
+    /// Reports that the program is ready to the node that has started it.
+    fn ready(&self, py: Python<'_>) -> PyResult<Operation> {
+        self.begin(py, move |endpoint| {
+            Box::pin(async move {
+                endpoint.ready().await?;
+                Ok(Done::Nothing)
+            })
+        })
+    }
+
     /// Joins a group, or leaves it.
     fn set_member(&self, py: Python<'_>, group: String, is_member: bool) -> PyResult<Operation> {
         self.begin(py, move |endpoint| {

@@ -25,4 +25,4 @@ pub use required::{
 };
 pub use requirement::{RequirementEvent, RequirementPolicy};
 pub use send_outcome::{GroupOutcome, SendOutcome, Tagged};
-pub use spec::{AppSpec, AppWiring, DynApp};
+pub use spec::{AppSpec, AppWiring, COMMAND_WORDS_MAX, CommandLine, CommandReadiness, DynApp, Program};

@@ -1,8 +1,11 @@
 //! The declaration of an application, which a node needs to start it.
 
+mod command;
 mod contracts;
 mod dyn_app;
 mod parameters;
+
+pub use self::command::{COMMAND_WORDS_MAX, CommandLine, CommandReadiness, Program};
 
 use std::{sync::Arc, time::Duration};
 
@@ -67,6 +70,8 @@ pub(super) struct Common {
     sends: Vec<PayloadType>,
     policy: Policy,
     place: Place,
+    /// The program, if the application is a command.
+    command: Option<CommandLine>,
     pub(super) down_policy: DownPolicy,
     pub(super) wills: Vec<Will>,
     pub(super) on_lost: RequirementPolicy,
@@ -119,6 +124,7 @@ impl<A: Actor<Context = AppContext<A>>> AppSpec<A> {
             sends: Vec::new(),
             policy: Policy { held: true, ..Policy::default() },
             place: Place::thread("apps"),
+            command: None,
             down_policy: DownPolicy::default(),
             wills: Vec::new(),
             on_lost: RequirementPolicy::default(),

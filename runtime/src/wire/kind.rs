@@ -149,6 +149,8 @@ impl Kind {
     /// A client declares the structure of a payload type that it handles or sends. The range of the other frames of
     /// LNCL is full.
     pub const LNCL_TYPE: Self = Self(0x60);
+    /// The program of a command is ready.
+    pub const LNCL_READY: Self = Self(0x61);
 
     /// The presses and releases of the stop that a node knows, and whether its outputs are safe.
     pub const STOP_STATE: Self = Self(0x70);

@@ -242,7 +242,7 @@ impl Handler<Delivery<Order>> for Drive {
 
 /// It does not inherit the output, because the scenario waits for the end of that.
 #[expect(clippy::zombie_processes, reason = "what becomes of it is what is tried")]
-fn start_a_sleeper(in_own_group: bool) {
+pub(super) fn start_a_sleeper(in_own_group: bool) {
     let mut command = Command::new("sleep");
     command.arg("120").stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null());
     if in_own_group {
@@ -254,7 +254,7 @@ fn start_a_sleeper(in_own_group: bool) {
 
 /// Does not return: another thread may take the signal, a moment later. The first SIGSEGV may be caught by
 /// Rust's handler for stack overflows, the second one is not.
-fn signal_myself(signal: Signal) -> ! {
+pub(super) fn signal_myself(signal: Signal) -> ! {
     loop {
         kill_process(getpid(), signal).expect("a process may signal itself");
         std::thread::sleep(Duration::from_millis(1));

@@ -1,6 +1,7 @@
 //! Applications in processes of their own: the same code as in a thread, killed in every way, without harm to
 //! their node.
 
+mod commands;
 mod death;
 mod fence;
 mod groups;

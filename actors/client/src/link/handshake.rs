@@ -276,8 +276,15 @@ mod tests {
         let (mut client, _) = listener.accept().unwrap();
         let (node, app) = (NodeAddress::new(1), AppAddress::new(0x8000_0001));
         let node_name = "played".to_owned();
-        let registered =
-            Registered { node, app, node_name, payload_max: 4_096, ring: Some(4_096), types: false };
+        let registered = Registered {
+            node,
+            app,
+            node_name,
+            payload_max: 4_096,
+            ring: Some(4_096),
+            types: false,
+            ready: false,
+        };
         let tid = Tid::new(node, app);
         let frame = payload::frame(Kind::LNCL_REGISTERED, payload::lncl_of(node), tid, &registered);
         client.write_all(&bytes_of(&frame)).unwrap();

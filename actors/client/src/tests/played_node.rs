@@ -174,8 +174,15 @@ fn register_client(socket: &UnixStream) -> Option<(Producer, Consumer)> {
     let ring = payload::read::<Register>(&asked.payload).unwrap().ring.then_some(RING_BYTES);
     let (node, app) = (NodeAddress::new(1), AppAddress::fixed(1).unwrap());
     let payload_max = PAYLOAD_MAX as u32;
-    let registered =
-        Registered { node, app, node_name: "played".to_owned(), payload_max, ring, types: false };
+    let registered = Registered {
+        node,
+        app,
+        node_name: "played".to_owned(),
+        payload_max,
+        ring,
+        types: false,
+        ready: false,
+    };
     let lncl = payload::lncl_of(node);
     let answer = payload::frame(Kind::LNCL_REGISTERED, lncl, Tid::new(node, app), &registered);
     let mut bytes = BytesMut::new();

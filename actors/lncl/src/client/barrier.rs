@@ -11,9 +11,9 @@ use super::{
         reader::Reader,
         session::{Order, Session},
     },
-    Client, encoded,
+    Client,
     end::ConnectionEnd,
-    write_some, write_soon,
+    writing::{encoded, write_some, write_soon},
 };
 use crate::State;
 
@@ -53,6 +53,7 @@ impl Client {
                     | Order::Introduce { .. }
                     | Order::Switch { .. }
                     | Order::DeclareType(_)
+                    | Order::Ready
                     | Order::Observe(_)
                     | Order::RefuseMessage { .. } => {
                         ConnectionEnd::Refused("wait for LNCL_REGISTERED".to_owned())

@@ -22,7 +22,8 @@ use super::{
         link_broker::Departure,
         registrar,
     },
-    Client, Ring, write_now,
+    Client, Ring,
+    writing::write_now,
 };
 
 /// Deadline of the final refusal if earlier messages fill the client's socket.
@@ -204,7 +205,13 @@ impl Drop for Client {
         let departure = std::mem::replace(&mut self.departure, Departure::LinksRemain);
         self.server.link_broker.remove(self.tid, departure);
         self.server.state.observed_links.remove(self.tid);
-        registrar::remove_owner(&self.server.state, self.peer.owner(), &self.cause);
+        match &self.command {
+            // Its supervisor reports the end of the process.
+            Some(port) => {
+                registrar::release_command(&self.server.state, port, self.tid.app, self.peer.id);
+            }
+            None => registrar::remove_owner(&self.server.state, self.peer.owner(), &self.cause),
+        }
         self.server.remove_client(self.peer.id);
         if !self.is_notified {
             self.send_refusal_now(

@@ -28,6 +28,7 @@ pub(super) async fn receive(
         | Order::Introduce { .. }
         | Order::Switch { .. }
         | Order::DeclareType(_)
+        | Order::Ready
         | Order::Observe(_)
         | Order::RefuseMessage { .. }
         | Order::Unregister => Err("an unregistered connection can only register".to_owned()),

@@ -13,7 +13,7 @@ use sinew_security::access::JoinGroupError;
 
 use super::{
     super::{
-        core::Registry,
+        core::{Owner, Registry},
         registrar,
         session::{Order, Session},
     },
@@ -86,7 +86,12 @@ impl Client {
     pub(super) fn while_registered<T>(&self, act: impl FnOnce(&State, &Registry) -> T) -> Option<T> {
         let state = &self.server.state;
         let registry = lock(&state.registry);
-        (registry.owner_of(self.tid.app) == Some(self.peer.owner())).then(|| act(state, &registry))
+        let owner = registry.owner_of(self.tid.app);
+        let is_registered = match &self.command {
+            Some(port) => owner == Some(Owner::Command) && port.is_held_by(self.peer.id),
+            None => owner == Some(self.peer.owner()),
+        };
+        is_registered.then(|| act(state, &registry))
     }
 
     /// Checks whether the client may join the group, and counts the join. An existing membership stays.

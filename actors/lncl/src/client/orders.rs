@@ -46,6 +46,8 @@ impl Client {
             Order::Introduce { to, correlation } => self.broker_link(to, correlation),
             Order::Switch { to, number, correlation } => self.switch(to, number, correlation),
             Order::DeclareType(declaration) => self.declare_type(declaration),
+            // Only the program of a command has a supervisor that waits for it.
+            Order::Ready => self.command.iter().for_each(|port| port.ready(self.peer.id)),
             Order::Observe(observed) => self.observe(&observed),
             Order::RefuseMessage { message, why } => self.refuse_message(&message, why),
             Order::Unregister => return ControlFlow::Break(ConnectionEnd::Unregistered),

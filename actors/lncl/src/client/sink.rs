@@ -9,6 +9,11 @@ use sinew_runtime::{
     wire::Message,
 };
 
+use super::{
+    super::command::{HandOver, Reading},
+    ClientOutlet,
+};
+
 /// Submits messages to a client's outlet. A message that can expire there requests the checks of LNCL, which run only
 /// while such messages are left.
 pub(super) struct ClientSink<S> {
@@ -47,6 +52,21 @@ impl<S: MessageSink> MessageSink for ClientSink<S> {
 
     fn cancel(&self, ticket: Ticket) -> bool {
         self.outlet.cancel(ticket)
+    }
+}
+
+impl HandOver for ClientSink<ClientOutlet> {
+    fn is_free(&self) -> bool {
+        self.outlet.waiting() == 0
+    }
+
+    fn reading(&self) -> Reading {
+        let unread = self.outlet.unread();
+        self.outlet.taking().map_or_else(Reading::default, |taking| Reading {
+            mark: taking.mark,
+            unread,
+            leaves_some: taking.leaves_some,
+        })
     }
 }
 

@@ -117,7 +117,7 @@ fn notify_app(state: &State, now: Time, app: AppAddress, entries: Vec<Entry>, fo
     match owner {
         // The application is gone.
         None => {}
-        Some(Owner::Client { .. }) => notify_client(state, now, app, entries, form),
+        Some(Owner::Client { .. } | Owner::Command) => notify_client(state, now, app, entries, form),
         Some(Owner::Node) if state.ctx.router.subscribes(app, Event::KIND) => {
             for entry in entries {
                 let (source, to) = (payload::lncl_of(state.ctx.node), Tid::new(state.ctx.node, app));

@@ -9,7 +9,10 @@ use std::{
     time::Duration,
 };
 
-use super::{ConfigError, ConfigFault, Interface, NodeConfig, Seed, WatchGroup, faults::quoted};
+use super::{
+    ConfigError, ConfigFault, Interface, NodeConfig, Seed, WatchGroup, command::check_commands,
+    faults::quoted,
+};
 use crate::limits::{FURTHER_MAX, NAME_BYTES_MAX, PATHS_MAX};
 
 /// Maximum bytes of a unix socket's path: the limit of every system, with the terminating zero.
@@ -84,6 +87,11 @@ pub(super) const AFTER: Range = range("record.after_ms", 1_000, 60_000, "ms");
 pub(super) const FROZEN_MAX: Range = range("record.frozen_max", 0, 64, "spans");
 pub(super) const PROBE: Range = range("rt.probe_ms", 0, 60_000, "ms");
 pub(super) const SLACK: Range = range("contracts.slack_ms", 0, 1_000, "ms");
+pub(super) const COMMAND_START: Range = range("command.start_ms", 10, 600_000, "ms");
+pub(super) const COMMAND_STOP: Range = range("command.stop_ms", 0, 60_000, "ms");
+pub(super) const COMMAND_HANG: Range = range("command.hang_ms", 20, 600_000, "ms, or false");
+pub(super) const COMMAND_BACKOFF_MIN: Range = range("command.backoff_min_ms", 1, 60_000, "ms");
+pub(super) const COMMAND_BACKOFF_MAX: Range = range("command.backoff_max_ms", 1, 600_000, "ms");
 /// Maximum number of names in `record.apps` and `record.types`, and maximum bytes of one.
 const RECORDED_MAX: usize = 64;
 const RECORDED_BYTES_MAX: usize = 255;
@@ -104,7 +112,7 @@ impl Range {
         }
     }
 
-    fn time(&self, faults: &mut Vec<ConfigFault>, found: Duration) {
+    pub(super) fn time(&self, faults: &mut Vec<ConfigFault>, found: Duration) {
         if found < Duration::from_millis(self.low) || found > Duration::from_millis(self.high) {
             faults.push(self.fault(format!("{found:?}")));
         }
@@ -154,6 +162,7 @@ impl NodeConfig {
         self.check_record(&mut faults);
         PROBE.time(&mut faults, self.rt.probe);
         SLACK.time(&mut faults, self.contracts.slack);
+        check_commands(&mut faults, &self.commands, self.lncl.socket.is_some());
         ConfigError::check(faults)
     }
 
@@ -380,7 +389,7 @@ fn check_node_name(faults: &mut Vec<ConfigFault>, key: &str, name: &str) {
     }
 }
 
-fn is_path(path: &Path) -> bool {
+pub(super) fn is_path(path: &Path) -> bool {
     let bytes = path.as_os_str().as_encoded_bytes();
     (1..=DIRECTORY_BYTES_MAX).contains(&bytes.len()) && !bytes.contains(&0)
 }

@@ -1,6 +1,10 @@
 //! Reads a configuration from TOML: the keys and their types. The check decides which values are legal.
 
+mod commands;
 mod reader;
+
+#[cfg(test)]
+pub(super) use self::commands::COMMAND_KEYS;
 
 use std::{
     fs::File,
@@ -23,7 +27,7 @@ use super::{
 /// Longest configuration file in bytes.
 const FILE_BYTES_MAX: u64 = 1 << 20;
 
-const SECTIONS: [&str; 13] = [
+const SECTIONS: [&str; 14] = [
     "node",
     "lncl",
     "gncl",
@@ -36,6 +40,7 @@ const SECTIONS: [&str; 13] = [
     "rt",
     "stop",
     "contracts",
+    "command",
     "app",
 ];
 
@@ -158,6 +163,7 @@ impl NodeConfig {
         reader.truth("stop.on_lost", &mut config.stop.on_lost);
         reader.truth("contracts.dry_run", &mut config.contracts.dry_run);
         reader.time(&check::SLACK, &mut config.contracts.slack);
+        config.commands = reader.read_commands();
         config.app_settings = reader.app_settings.take().unwrap_or_default();
         let faults = reader.finish(&config).err().map(ConfigError::into_vec).unwrap_or_default();
         Ok((config, faults))

@@ -6,6 +6,7 @@
 
 mod app_settings;
 mod check;
+mod command;
 mod contracts;
 mod faults;
 mod file;
@@ -40,6 +41,7 @@ use sinew_runtime::{
 
 pub use self::{
     app_settings::AppSettings,
+    command::CommandConfig,
     contracts::ContractsConfig,
     log_level::LogLevel,
     real_time::RtConfig,
@@ -107,6 +109,8 @@ pub struct NodeConfig {
     pub stop: StopConfig,
     /// The contracts of applications.
     pub contracts: ContractsConfig,
+    /// The programs that the node starts and supervises. Default: none.
+    pub commands: Vec<CommandConfig>,
     /// The settings of applications: the tables `[app.NAME]` of its file, which [`NodeConfig::app`] reads.
     /// Default: none.
     pub app_settings: AppSettings,
@@ -435,6 +439,7 @@ impl NodeConfig {
             rt: RtConfig::default(),
             stop: StopConfig::default(),
             contracts: ContractsConfig::default(),
+            commands: Vec::new(),
             app_settings: AppSettings::default(),
         }
     }

@@ -178,6 +178,9 @@ impl NodeBuilder {
                 Err(found) => faults.extend(found.into_vec()),
             }
         }
+        for command in &self.config.commands {
+            self.tree = std::mem::replace(&mut self.tree, SupervisorSpec::new("")).app(command);
+        }
         faults.extend(self.config.unclaimed_settings());
         ConfigError::check(faults)
     }

@@ -54,7 +54,7 @@ pub(super) fn verdicts(
 /// Returns whether the application at `app` belongs to this process, or to another process of the same user or of root.
 pub(super) fn is_of_the_nodes_user(state: &NodeState, app: AppAddress) -> bool {
     match lock(&state.lncl.registry).owner_of(app) {
-        Some(Owner::Node) => true,
+        Some(Owner::Node | Owner::Command) => true,
         // Without a list there are no clients of other users, and nothing to reload.
         Some(Owner::Client { .. }) => state
             .security

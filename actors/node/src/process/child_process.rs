@@ -64,6 +64,16 @@ impl Process {
         })
     }
 
+    /// Asks it, and the processes that it started, to end (SIGTERM).
+    pub(super) fn terminate(&self) {
+        self.group.terminate();
+    }
+
+    /// Returns whether it has ended in order, with exit code 0.
+    pub(super) fn has_succeeded(&self) -> bool {
+        matches!(self.group.ending(), Ok(Some(status)) if status.exit_status() == Some(0))
+    }
+
     pub(super) fn kill(&self) {
         self.kill_flag.set();
         self.group.kill();

@@ -34,6 +34,16 @@ impl Group {
         &self.pidfd
     }
 
+    /// Asks the leader and all processes of its group to end (SIGTERM).
+    pub(super) fn terminate(&self) {
+        let is_numbered = lock(&self.is_numbered);
+        let is_led = *is_numbered && self.ending().is_ok();
+        if !is_led || kill_process_group(self.leader, Signal::TERM).is_err() {
+            // The leader has no group yet, or has ended. An error means that no process is left.
+            let _ = pidfd_send_signal(&self.pidfd, Signal::TERM);
+        }
+    }
+
     /// Kills the leader, if it lives, and all processes of its group.
     pub(super) fn kill(&self) {
         // An error means that no process is left.

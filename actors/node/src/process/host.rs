@@ -32,6 +32,7 @@ use tokio_util::codec::Decoder;
 
 use super::{
     child_link::ChildLink,
+    program::become_program,
     protocol::{self, Beat, ExitReport, FRAME_BYTES_MAX, Welcome},
     role::{Hosting, die},
 };
@@ -60,6 +61,9 @@ pub(super) fn host(config: &NodeConfig, apps: Vec<DynApp>, hosting: Hosting) -> 
         );
         std::process::exit(2);
     };
+    if let Some(line) = app.command() {
+        become_program(config, &name, line, socket);
+    }
     let config = config.clone();
     let thread = std::thread::Builder::new().name(name.clone());
     // A thread of its own, since the caller's thread may have a runtime already.

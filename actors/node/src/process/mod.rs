@@ -23,6 +23,8 @@
 //! | `child_process` | node | one process by its pidfd: killed, waited for, and its exit status |
 //! | `predecessor` | node | the former process: the next one waits for its end |
 //! | `spawn` | node | starts processes and reaps them |
+//! | `command` | node | the supervised process of a command, which is a client of LNCL |
+//! | `program` | child | becomes the program of a command |
 //! | `role` | child | whether this process is a node or such a child |
 //! | `host` | child | runs the application |
 //! | `inbox` | child | the application's received messages |
@@ -30,6 +32,7 @@
 
 mod child_link;
 mod child_process;
+mod command;
 #[cfg(feature = "fuzzing")]
 #[doc(hidden)]
 pub mod fuzzing;
@@ -39,12 +42,14 @@ mod inbox;
 mod link;
 mod names;
 mod predecessor;
+mod program;
 mod protocol;
 mod role;
 mod spawn;
 mod supervision;
 mod window;
 
+pub(crate) use command::Command;
 pub(crate) use link::Link;
 
 use role::{Role, role};
@@ -52,7 +57,14 @@ pub(crate) use spawn::check_kernel;
 
 use sinew_model::config::NodeConfig;
 
-use crate::SupervisorSpec;
+use crate::{NodeState, SupervisorSpec};
+
+/// Returns the environment variable by which this program, started again, knows its application.
+fn variable(state: &NodeState, app: &str) -> String {
+    let (parent, node) = (std::process::id(), state.ctx.node.bits());
+    // No name contains a newline.
+    format!("{parent}\n{node}\n{}\n{app}", state.ctx.config.name)
+}
 
 /// Handles the builder of a node in a process that hosts an application. Returns whether the builder must not
 /// start the node. Does not return if this process hosts one of its applications.

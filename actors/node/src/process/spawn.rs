@@ -41,6 +41,22 @@ const REAPING_MAX: Duration = Duration::from_millis(256);
 pub(super) struct Started {
     process: NewProcess,
     socket: UnixStream,
+    output: Option<Output>,
+}
+
+/// What a started process does.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Role {
+    /// It hosts an application of this program.
+    Host,
+    /// It becomes the program of a command.
+    Command,
+}
+
+/// The ends of the pipes of a command's standard output and standard error.
+pub(super) struct Output {
+    pub(super) stdout: OwnedFd,
+    pub(super) stderr: OwnedFd,
 }
 
 struct NewProcess {
@@ -49,15 +65,15 @@ struct NewProcess {
 }
 
 impl Started {
-    fn new(group: Arc<Group>, socket: UnixStream) -> Self {
-        Self { process: NewProcess { group, is_kept: false }, socket }
+    fn new(group: Arc<Group>, socket: UnixStream, output: Option<Output>) -> Self {
+        Self { process: NewProcess { group, is_kept: false }, socket, output }
     }
 
-    /// Returns the process, and the other end of its standard input. The caller must kill it, and pass it to
-    /// [`reap`].
-    pub(super) fn keep(mut self) -> (Arc<Group>, UnixStream) {
+    /// Returns the process, the other end of its standard input, and those of its output if it is a command. The caller
+    /// must kill it, and pass it to [`reap`].
+    pub(super) fn keep(mut self) -> (Arc<Group>, UnixStream, Option<Output>) {
         self.process.is_kept = true;
-        (self.process.group.clone(), self.socket)
+        (self.process.group.clone(), self.socket, self.output)
     }
 }
 
@@ -74,6 +90,7 @@ enum Order {
     /// Starts this program again with this value of the variable, and registers it as the predecessor of the
     /// next one.
     Start {
+        role: Role,
         variable: String,
         predecessor: Arc<Predecessor>,
         answer: oneshot::Sender<Result<Started, String>>,
@@ -112,12 +129,24 @@ pub(crate) fn check_kernel() -> Result<(), String> {
     }
 }
 
-/// Starts this program again, as a host. It becomes the `predecessor` of the next one, even if the requester
+/// Starts this program again, in this role. It becomes the `predecessor` of the next one, even if the requester
 /// is gone.
-pub(super) async fn start(variable: String, predecessor: Arc<Predecessor>) -> Result<Started, String> {
+async fn start(role: Role, variable: String, predecessor: Arc<Predecessor>) -> Result<Started, String> {
     let (answer, started) = oneshot::channel();
-    order(Order::Start { variable, predecessor, answer })?;
+    order(Order::Start { role, variable, predecessor, answer })?;
     started.await.map_err(|_| "the thread that starts processes has ended".to_owned())?
+}
+
+/// Starts this program again after the former process of `app` has ended.
+pub(super) async fn start_next(
+    role: Role,
+    variable: String,
+    predecessor: &Arc<Predecessor>,
+    app: &str,
+) -> Result<Started, String> {
+    let ended = predecessor.has_ended(app).await;
+    ended.map_err(|cause| format!("it is unknown whether its former process has ended: {cause}"))?;
+    start(role, variable, predecessor.clone()).await
 }
 
 /// Reaps a process that has ended or was killed, on another thread. The kernel may take longer to clean up
@@ -159,10 +188,10 @@ fn run(inbox: &Receiver<Order>) {
         match order {
             // The requester is gone: it was stopped, or failed.
             Ok(Order::Start { answer, .. }) if answer.is_closed() => {}
-            Ok(Order::Start { variable, predecessor, answer }) => {
+            Ok(Order::Start { role, variable, predecessor, answer }) => {
                 // Processes of an earlier group must not hold resources that the next process needs.
                 unreaped.retain(|group| !group.has_been_reaped());
-                let started = start_now(&variable)
+                let started = start_now(role, &variable)
                     .inspect(|started| predecessor.set(started.process.group.pidfd().clone()));
                 // If the requester is gone by now, the process is dropped and killed.
                 drop(answer.send(started));
@@ -175,7 +204,7 @@ fn run(inbox: &Receiver<Order>) {
     }
 }
 
-fn start_now(variable: &str) -> Result<Started, String> {
+fn start_now(role: Role, variable: &str) -> Result<Started, String> {
     let fault = |wanted, doing: &'static str| {
         move |cause: io::Error| format!("{doing}: {cause}; {}", remedy(wanted, &cause))
     };
@@ -183,23 +212,29 @@ fn start_now(variable: &str) -> Result<Started, String> {
     let mut arguments = std::env::args_os();
     // Not by its path, since that file may have been replaced.
     let mut command = Command::new("/proc/self/exe");
-    let child = command
+    command
         .arg0(arguments.next().unwrap_or_else(|| OsString::from("sinew")))
         .args(arguments)
         .env(VARIABLE, variable)
-        .stdin(Stdio::from(OwnedFd::from(theirs)))
+        .stdin(Stdio::from(OwnedFd::from(theirs)));
+    match role {
         // Ctrl-C concerns only the node, which then stops its applications in order. The group also ends the
         // processes that the child starts.
-        .process_group(0)
-        .spawn()
-        .map_err(fault(Wanted::Process, "this program cannot be started again"))?;
+        Role::Host => command.process_group(0),
+        // It begins a session of its own, which the leader of a group cannot do.
+        Role::Command => command.stdout(Stdio::piped()).stderr(Stdio::piped()),
+    };
+    let mut child =
+        command.spawn().map_err(fault(Wanted::Process, "this program cannot be started again"))?;
     let pid = Pid::from_child(&child);
+    let output = child.stdout.take().zip(child.stderr.take());
+    let output = output.map(|(out, err)| Output { stdout: out.into(), stderr: err.into() });
     // It is our unreaped child, so its pid is not reused.
     match pidfd_open(pid, PidfdFlags::empty()) {
-        Ok(pidfd) => Ok(Started::new(Arc::new(Group::new(pid, pidfd)), socket)),
+        Ok(pidfd) => Ok(Started::new(Arc::new(Group::new(pid, pidfd)), socket, output)),
         Err(cause) => {
-            let mut child = child;
             let _ = kill_process_group(pid, Signal::KILL);
+            let _ = child.kill();
             let _ = child.wait();
             Err(fault(Wanted::Descriptor, "no descriptor for the process (pidfd_open)")(cause.into()))
         }

@@ -38,7 +38,8 @@ use super::{
     link::{FinalRead, Link},
     names::KnownNames,
     protocol::{self, Beat, ExitReport, FRAME_BYTES_MAX, NameLookup, Names, Progress, Welcome},
-    spawn::{self, Started},
+    spawn::{self, Role, Started},
+    variable,
 };
 use crate::NodeState;
 
@@ -89,10 +90,10 @@ impl RunningActor for ProcessSupervision {
 async fn run(hosted: Arc<Hosted>, ready: ReadyGate, stop: Rc<Notify>) -> Reason {
     // A stop does not wait for the end of the former process.
     let started = tokio::select! {
-        started = start(&hosted) => started,
+        started = hosted.start() => started,
         () = stop.notified() => return Reason::Shutdown,
     };
-    let (group, socket) = match started {
+    let (group, socket, _) = match started {
         Ok(started) => started.keep(),
         Err(why) => return Reason::ProcessEnded(format!("it could not be started: {why}")),
     };
@@ -108,20 +109,11 @@ async fn run(hosted: Arc<Hosted>, ready: ReadyGate, stop: Rc<Notify>) -> Reason 
     }
 }
 
-/// Starts the process after the former one has ended.
-async fn start(hosted: &Hosted) -> Result<Started, String> {
-    let predecessor = hosted.link.predecessor();
-    let ended = predecessor.has_ended(&hosted.name).await;
-    ended.map_err(|cause| format!("it is unknown whether its former process has ended: {cause}"))?;
-    spawn::start(hosted.variable(), predecessor.clone()).await
-}
-
 impl Hosted {
-    fn variable(&self) -> String {
-        let parent = std::process::id();
-        let node = self.state.ctx.node.bits();
-        // No name contains a newline.
-        format!("{parent}\n{node}\n{}\n{}", self.state.ctx.config.name, self.name)
+    /// Starts the process after the former one has ended.
+    async fn start(&self) -> Result<Started, String> {
+        let variable = variable(&self.state, &self.name);
+        spawn::start_next(Role::Host, variable, self.link.predecessor(), &self.name).await
     }
 }
 
@@ -392,6 +384,7 @@ impl Child {
             | Order::Introduce { .. }
             | Order::Switch { .. }
             | Order::DeclareType(_)
+            | Order::Ready
             | Order::Observe(_)
             | Order::Unregister => {
                 return Err("it sent a frame that only a client of LNCL may send".to_owned());

@@ -2,8 +2,9 @@
 
 use std::sync::Arc;
 
+use sinew_lncl::CommandPort;
 use sinew_runtime::{
-    app::{AppWiring, DynApp},
+    app::{AppWiring, CommandReadiness, DynApp},
     mailbox::{Bounds, Mailbox},
     pending::{AppSink, Pending},
     router::MessageSink,
@@ -72,6 +73,21 @@ impl Root {
         self.notify_if_running();
     }
 
+    /// Returns the place of an application that is a command, with its readiness.
+    fn command_port(
+        &self,
+        app: &DynApp,
+        mailbox: &Arc<Mailbox>,
+    ) -> Result<Option<(Arc<CommandPort>, CommandReadiness)>, StartError> {
+        let Some(line) = app.command() else { return Ok(None) };
+        if self.state.ctx.config.lncl.socket.is_none() {
+            let why = "it is a command: its program joins at the node's socket; set `lncl.socket`".to_owned();
+            return Err(StartError::Application { name: app.name().to_owned(), why });
+        }
+        let awaits_ready = line.readiness == CommandReadiness::Called;
+        Ok(Some((CommandPort::new(app.name(), mailbox.clone(), awaits_ready), line.readiness)))
+    }
+
     /// Assigns an application its address, its mailbox and its routes.
     pub(crate) fn register(&mut self, app: &DynApp) -> Result<ChildSpec, StartError> {
         let config = &self.state.ctx.config;
@@ -81,10 +97,13 @@ impl Root {
         self.apps.check_parameters(app)?;
         let mailbox = Mailbox::new(Bounds { messages: config.mailbox_capacity, bytes: config.mailbox_bytes });
         let pending = Pending::new(WAITS_MAX);
-        let hosted = app.place().own_process.then(|| process::Link::new(&self.state, mailbox.clone()));
-        let sink: Arc<dyn MessageSink> = match &hosted {
-            Some(link) => link.clone(),
-            None => Arc::new(AppSink { pending: pending.clone(), inbox: mailbox.clone() }),
+        let command = self.command_port(app, &mailbox)?;
+        let is_hosted = app.place().own_process && command.is_none();
+        let hosted = is_hosted.then(|| process::Link::new(&self.state, mailbox.clone()));
+        let sink: Arc<dyn MessageSink> = match (&hosted, &command) {
+            (Some(link), _) => link.clone(),
+            (None, Some((port, _))) => port.clone(),
+            (None, None) => Arc::new(AppSink { pending: pending.clone(), inbox: mailbox.clone() }),
         };
         let kinds = app.kinds();
         let local = sinew_lncl::LocalApp {
@@ -99,8 +118,13 @@ impl Root {
             sink,
             events: kinds.iter().map(|(kind, _)| *kind).collect(),
         };
-        let tid = sinew_lncl::register_local(&self.state.lncl, local).map_err(|error| {
-            StartError::Application { name: app.name().to_owned(), why: error.to_string() }
+        let registered = match &command {
+            Some((port, _)) => sinew_lncl::register_command(&self.state.lncl, local, port.clone()),
+            None => sinew_lncl::register_local(&self.state.lncl, local),
+        };
+        let tid = registered.map_err(|error| StartError::Application {
+            name: app.name().to_owned(),
+            why: error.to_string(),
         })?;
         self.state.types.register(tid.app, app.types(), app.sends());
         self.state.contracts.register(tid, app);
@@ -116,14 +140,17 @@ impl Root {
             self.hosted.insert(app.name().to_owned(), Arc::downgrade(link));
         }
         let mut policy = app.policy().clone();
-        if hosted.is_some() && policy.progress_within.is_some() {
+        if app.place().own_process && policy.progress_within.is_some() {
             // The process of the application is supervised. The link shares a thread with the node's layers,
             // and has the same limits.
             policy.progress_within = Policy::default().progress_within;
         }
-        let (place, launch) = match hosted {
-            Some(link) => (Place::io(), link.launch(&self.state, wiring.sender, app)),
-            None => (app.place().clone(), app.launch(wiring)),
+        let (place, launch) = match (hosted, command) {
+            (Some(link), _) => (Place::io(), link.launch(&self.state, wiring.sender, app)),
+            (None, Some((port, readiness))) => {
+                (Place::io(), process::Command::launch(&self.state, port, tid, readiness, app))
+            }
+            (None, None) => (app.place().clone(), app.launch(wiring)),
         };
         #[cfg(feature = "fault-points")]
         let launch = super::super::faults::arm(&self.state, app, launch);

@@ -257,6 +257,14 @@ impl<S: Socket> Connection<S> {
         if let Link::Up(socket) = &mut self.link { socket.account().taken } else { self.taken_at_last }
     }
 
+    /// Returns the number of written bytes that the peer has not taken; `None` if the socket cannot report them, or
+    /// without a connection.
+    pub(super) fn unread(&mut self) -> Option<u64> {
+        let Link::Up(socket) = &mut self.link else { return None };
+        let Account { written, taken } = socket.account();
+        written.checked_sub(taken)
+    }
+
     /// Returns the peer's progress, or `None` without a connection. Reads only existing counters. `sent` is
     /// the number of written messages.
     pub(super) fn progress(&mut self, unsent: &Unsent, sent: u64) -> Option<Taking> {

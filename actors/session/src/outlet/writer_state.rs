@@ -456,6 +456,11 @@ impl<S: Socket> WriterState<S> {
         self.connection.progress(&self.unsent, self.counters.counts.sent)
     }
 
+    /// Returns the number of written bytes that the peer has not taken, if it is known.
+    pub(super) fn unread(&mut self) -> Option<u64> {
+        self.connection.unread()
+    }
+
     /// Returns the number of queued messages, and of those kept because their arrival is not acknowledged.
     pub(super) fn left(&self) -> usize {
         self.unsent.len() + self.numbering.kept()

@@ -398,6 +398,14 @@ class AsyncEndpoint:
         finally:
             self._lock.release()
 
+    async def ready(self) -> None:
+        """Reports to the node that has started this program that it is ready.
+
+        It has an effect where the node's `[[command]]` says `ready = "called"`. Other programs are ready when they have
+        registered.
+        """
+        await self._run(self._plans.ready())
+
     # The end
 
     async def unregister(self) -> None:

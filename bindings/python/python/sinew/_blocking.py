@@ -268,6 +268,14 @@ class Endpoint:
         """
         return make_guard(self._core, source, protected, safe)
 
+    def ready(self) -> None:
+        """Reports to the node that has started this program that it is ready.
+
+        It has an effect where the node's `[[command]]` says `ready = "called"`. Other programs are ready when they have
+        registered.
+        """
+        self._run(self._plans.ready())
+
     # The end
 
     def unregister(self) -> None:

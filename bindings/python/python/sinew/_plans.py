@@ -124,6 +124,9 @@ class Plans:
         generation = yield lambda: self.core.meet(name, parties, within, options)
         return int(generation)
 
+    def ready(self) -> Plan[None]:
+        yield self.core.ready
+
     def unregister(self) -> Plan[None]:
         yield self.core.unregister
 

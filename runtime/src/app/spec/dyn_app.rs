@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use sinew_params::Parameters;
 
-use super::{AppWiring, Common, DynApp};
+use super::{AppWiring, CommandLine, Common, DynApp};
 use crate::{
     app::{DownState, RequirementPolicy, WILLS_MAX, Will, contract},
     supervision::{Launch, Place, Policy},
@@ -73,6 +73,12 @@ impl DynApp {
         &self.common.place
     }
 
+    /// Returns the program of the application, if it is a command.
+    #[must_use]
+    pub const fn command(&self) -> Option<&CommandLine> {
+        self.common.command.as_ref()
+    }
+
     /// Adds one more injected fault.
     #[cfg(feature = "fault-points")]
     pub fn plan_fault(&mut self, fault: crate::supervision::fault::Fault) {
@@ -112,6 +118,9 @@ impl DynApp {
             ));
         }
         if let Some(why) = contract::fault(self.name(), contracts) {
+            return Some(why);
+        }
+        if let Some(why) = self.command().and_then(|line| line.fault(self.place(), *on_lost)) {
             return Some(why);
         }
         match on_lost {

@@ -5,15 +5,18 @@
 //! `docs/book/src/reference/configuration.md`, the complete file `node.toml` and the JSON Schema
 //! `node.schema.json` beside it. Without `UPDATE` the test compares them.
 
+mod commands;
 mod rows;
 mod tests;
 
 use std::fmt::Write as _;
 
+use commands::COMMAND_ROWS;
 use rows::ROWS;
 use serde_json::{Map, Value, json};
 
 use super::*;
+use crate::config::command::COMMANDS_MAX;
 
 /// One key of a node's file.
 struct Row {
@@ -57,10 +60,12 @@ enum Kind {
     Names(usize),
     /// Groups of nodes.
     Watch,
+    /// A program and its arguments, at most this many texts.
+    Words(usize),
 }
 
 /// Sections, in the order of the file, with a heading.
-const SECTIONS: [(&str, &str); 12] = [
+const SECTIONS: [(&str, &str); 13] = [
     ("node", "The node"),
     ("lncl", "Applications of this host"),
     ("gncl", "Connections between nodes"),
@@ -73,8 +78,11 @@ const SECTIONS: [(&str, &str); 12] = [
     ("rt", "The proof of real time"),
     ("stop", "The stop of the whole system"),
     ("contracts", "Contracts of applications"),
+    (COMMAND, "A program that the node supervises"),
 ];
 
+/// The section that a file may have several times.
+const COMMAND: &str = "command";
 /// Longest cell of a table, and longest line of the complete file.
 const CELL_MAX: usize = 200;
 const LINE_MAX: usize = 100;
@@ -119,7 +127,7 @@ impl Kind {
             Self::OneOf(_) | Self::Name | Self::NodeAddress => "text",
             Self::PathOrFalse(_) | Self::EndpointOrFalse { .. } => "text, or `false`",
             Self::Interfaces => "text, or list of texts",
-            Self::Addresses(_) | Self::Seeds(_) | Self::Names(_) => "list of texts",
+            Self::Addresses(_) | Self::Seeds(_) | Self::Names(_) | Self::Words(_) => "list of texts",
             Self::Watch => "list of tables",
         }
     }
@@ -141,6 +149,7 @@ impl Kind {
             Self::Seeds(max) => format!("at most {max}, each `address:port`"),
             Self::Names(max) => format!("at most {max} names of 1 to {RECORDED_BYTES_MAX} bytes"),
             Self::Watch => format!("at most {WATCH_MAX} groups of 1 to {WATCHED_NAMES_MAX} names"),
+            Self::Words(max) => format!("1 to {max} texts"),
         }
     }
 
@@ -173,6 +182,11 @@ impl Kind {
             }
             Self::Seeds(max) => texts(*max, json!({ "type": "string", "pattern": SEED })),
             Self::Names(max) => texts(*max, text(RECORDED_BYTES_MAX)),
+            Self::Words(max) => {
+                let mut words = texts(*max, json!({ "type": "string" }));
+                words["minItems"] = 1.into();
+                words
+            }
             Self::Watch => {
                 let mut names = texts(WATCHED_NAMES_MAX, text(NAME_BYTES_MAX));
                 names["minItems"] = 1.into();
@@ -198,16 +212,27 @@ fn or_false(schema: &Value) -> Value {
     json!({ "anyOf": [schema, { "const": false }] })
 }
 
+/// Returns the rows of a section.
+fn rows_of(section: &str) -> impl Iterator<Item = &'static Row> {
+    ROWS.iter().chain(COMMAND_ROWS).filter(move |row| row.section() == section)
+}
+
+/// Returns the heading of a section in a file.
+fn header(section: &str) -> String {
+    if section == COMMAND { format!("[[{section}]]") } else { format!("[{section}]") }
+}
+
 /// Returns the tables, one per section.
 fn tables() -> String {
     let mut page = String::new();
     for (section, heading) in SECTIONS {
         let _ = write!(
             page,
-            "\n### `[{section}]`: {heading}\n\n| key | type | default | range | effect | cost, or note |\n\
-             | --- | --- | --- | --- | --- | --- |\n"
+            "\n### `{}`: {heading}\n\n| key | type | default | range | effect | cost, or note |\n\
+             | --- | --- | --- | --- | --- | --- |\n",
+            header(section)
         );
-        for row in ROWS.iter().filter(|row| row.section() == section) {
+        for row in rows_of(section) {
             let Row { kind, effect, note, .. } = row;
             let (leaf, default) = (row.leaf(), row.default_shown());
             let _ = writeln!(
@@ -227,13 +252,17 @@ fn complete_file() -> String {
     let mut file =
         "# Every key of a node's file, with its default. Only node.name has to be set.\n".to_owned();
     for (section, _) in SECTIONS {
-        let _ = write!(file, "\n[{section}]\n");
-        for row in ROWS.iter().filter(|row| row.section() == section) {
+        // A file has no command by default, so that its keys are comments.
+        let off = if section == COMMAND { "# " } else { "" };
+        let _ = write!(file, "\n{off}{}\n", header(section));
+        for row in rows_of(section) {
             for line in [row.effect, &format!("Legal: {}.", row.kind.range())].into_iter().flat_map(wrapped) {
                 let _ = writeln!(file, "# {line}");
             }
             let _ = match (row.default(), row.key) {
-                (Some(value), _) => writeln!(file, "{} = {value}", row.leaf()),
+                (Some(value), _) => writeln!(file, "{off}{} = {value}", row.leaf()),
+                (None, "command.name") => writeln!(file, "# name = \"knee.drive\""),
+                (None, "command.run") => writeln!(file, "# run = [\"python3\", \"knee.py\"]"),
                 (None, "node.address") => writeln!(file, "# address = \"127.0.0.2\""),
                 (None, _) => writeln!(file, "{} = \"knee\"", row.leaf()),
             };
@@ -264,7 +293,7 @@ fn schema() -> Value {
     let mut sections = Map::new();
     for (section, heading) in SECTIONS {
         let mut keys = Map::new();
-        for row in ROWS.iter().filter(|row| row.section() == section) {
+        for row in rows_of(section) {
             let mut schema = row.kind.schema();
             let description = [row.effect, row.note].join(" ").replace('`', "");
             schema["description"] = description.trim_end().into();
@@ -276,6 +305,10 @@ fn schema() -> Value {
         let mut table = json!({ "type": "object", "description": heading, "properties": keys, "additionalProperties": false });
         if section == "node" {
             table["required"] = json!(["name"]);
+        }
+        if section == COMMAND {
+            table["required"] = json!(["name", "run"]);
+            table = json!({ "type": "array", "maxItems": COMMANDS_MAX, "items": table });
         }
         sections.insert(section.to_owned(), table);
     }

@@ -22,20 +22,23 @@ pub(super) struct Reader<'t> {
     text: &'t str,
     pub(super) values: BTreeMap<&'static str, &'t Spanned<DeValue<'t>>>,
     pub(super) app_settings: Option<AppSettings>,
+    /// The tables `[[command]]`.
+    pub(super) commands: Option<&'t Spanned<DeValue<'t>>>,
     faults: Vec<ConfigFault>,
 }
 
 /// Sorting the file's keys.
 impl<'t> Reader<'t> {
     pub(super) fn new(text: &'t str, table: &'t DeTable<'t>) -> Self {
-        let mut reader = Self { text, values: BTreeMap::new(), app_settings: None, faults: Vec::new() };
+        let mut reader = Self::empty(text);
         for (name, value) in table {
             let section = SECTIONS.into_iter().find(|section| *section == name.get_ref());
             match (section, value.get_ref()) {
                 (Some("app"), DeValue::Table(table)) => {
                     reader.app_settings = Some(AppSettings::read(text, table));
                 }
-                (Some(section), DeValue::Table(table)) => reader.add_section(section, table),
+                (Some("command"), _) => reader.commands = Some(value),
+                (Some(section), DeValue::Table(table)) => reader.add_keys(section, table, &KEYS),
                 (Some(section), _) => {
                     let legal = format!("a section [{section}]");
                     let remedy = format!("write [{section}] on a line of its own and its keys below");
@@ -48,14 +51,31 @@ impl<'t> Reader<'t> {
         reader
     }
 
-    fn add_section(&mut self, section: &'static str, table: &'t DeTable<'t>) {
+    const fn empty(text: &'t str) -> Self {
+        Self { text, values: BTreeMap::new(), app_settings: None, commands: None, faults: Vec::new() }
+    }
+
+    /// Returns a reader without values, for another table of the same file.
+    pub(super) const fn beside(&self) -> Self {
+        Self::empty(self.text)
+    }
+
+    /// Adds the faults of another reader. Returns whether it has none.
+    pub(super) fn take_faults(&mut self, other: Self) -> bool {
+        let is_faultless = other.faults.is_empty();
+        self.faults.extend(other.faults);
+        is_faultless
+    }
+
+    /// Adds the values of a table by their full keys, which are among `known`.
+    pub(super) fn add_keys(&mut self, section: &'static str, table: &'t DeTable<'t>, known: &[&'static str]) {
         for (name, value) in table {
             let full = format!("{section}.{}", name.get_ref());
-            match KEYS.into_iter().find(|key| **key == *full) {
+            match known.iter().copied().find(|key| *key == full) {
                 Some(key) => {
                     self.values.insert(key, value);
                 }
-                None => self.unknown(name, &full, &KEYS),
+                None => self.unknown(name, &full, known),
             }
         }
     }

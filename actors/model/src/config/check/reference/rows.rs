@@ -484,11 +484,11 @@ pub(super) const ROWS: &[Row] = &[
     },
 ];
 
-fn millis(duration: Duration) -> Value {
+pub(super) fn millis(duration: Duration) -> Value {
     u64::try_from(duration.as_millis()).expect("a time of this configuration").into()
 }
 
-fn path(path: Option<&Path>) -> Value {
+pub(super) fn path(path: Option<&Path>) -> Value {
     path.map_or(Value::Bool(false), |path| json!(path.to_string_lossy()))
 }
 

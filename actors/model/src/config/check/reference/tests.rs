@@ -1,7 +1,7 @@
 //! Whether the reference is that of the code.
 
 use super::*;
-use crate::config::file::KEYS;
+use crate::config::file::{COMMAND_KEYS, KEYS};
 
 const MARKERS: [&str; 2] = ["<!-- generated: begin -->", "<!-- generated: end -->"];
 /// Set, the files are written instead of compared.
@@ -27,6 +27,13 @@ fn updated(file: &str, text: &str) -> String {
 /// A file with `value` for `key`, and with neighbours that allow every legal value.
 fn file_with(key: &str, value: &Value) -> String {
     let (section, leaf) = key.split_once('.').unwrap();
+    if section == COMMAND {
+        let others =
+            [("name", "'knee'"), ("run", "['knee']"), ("backoff_max_ms", "600000"), ("backoff_min_ms", "1")];
+        let others = others.iter().filter(|(other, _)| *other != leaf);
+        let others: String = others.map(|(other, value)| format!("{other} = {value}\n")).collect();
+        return format!("[node]\nname = 'k'\n[lncl]\nsocket = '/k'\n[[command]]\n{others}{leaf} = {value}\n");
+    }
     let name = if key == "node.name" { "" } else { "name = 'knee'\n" };
     let neighbour = match key {
         "gncl.redial_min_ms" => "redial_max_ms = 60000\n",
@@ -59,6 +66,7 @@ fn legal(kind: &Kind) -> Vec<Value> {
         // TOML encodes tables differently than JSON.
         Kind::Names(_) => vec![json!([]), json!(["leg.*", "knee"])],
         Kind::Watch => vec![json!([])],
+        Kind::Words(_) => vec![json!(["python3"]), json!(["python3", "knee.py", ""])],
     }
 }
 
@@ -69,13 +77,14 @@ fn every_key_that_the_reader_accepts_has_a_row() {
         KEYS,
         "rows of check/reference/rows.rs, and keys"
     );
+    assert_eq!(COMMAND_ROWS.iter().map(|row| row.key).collect::<Vec<_>>(), COMMAND_KEYS);
     let sections: Vec<_> = SECTIONS.iter().map(|(section, _)| *section).collect();
     assert!(ROWS.iter().all(|row| sections.contains(&row.section())));
 }
 
 #[test]
 fn every_row_is_about_the_setting_of_its_key() {
-    for row in ROWS {
+    for row in ROWS.iter().chain(COMMAND_ROWS) {
         for value in legal(&row.kind) {
             let text = file_with(row.key, &value);
             let config = NodeConfig::from_toml(&text).unwrap_or_else(|faults| panic!("{faults}\n{text}"));
@@ -89,7 +98,7 @@ fn every_row_is_about_the_setting_of_its_key() {
 
 #[test]
 fn choices_match_the_reader() {
-    for row in ROWS {
+    for row in ROWS.iter().chain(COMMAND_ROWS) {
         let Kind::OneOf(texts) = &row.kind else { continue };
         let faults = NodeConfig::from_toml(&file_with(row.key, &json!("none of them"))).unwrap_err();
         let named: Vec<_> = faults.faults()[0].legal.split('"').skip(1).step_by(2).collect();
@@ -99,7 +108,7 @@ fn choices_match_the_reader() {
 
 #[test]
 fn every_cell_is_a_short_sentence() {
-    for row in ROWS {
+    for row in ROWS.iter().chain(COMMAND_ROWS) {
         for sentence in [row.effect, row.note] {
             let words = sentence.split_whitespace().count();
             assert!(words <= 25 && sentence.len() <= CELL_MAX, "{}, {words} words: {sentence}", row.key);
