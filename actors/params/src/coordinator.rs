@@ -1,7 +1,7 @@
 //! The coordinator of a transaction: it begins one, asks for the outcomes, and repairs a mixed one. Pure: times are
 //! arguments, and the caller sends.
 //!
-//! The participants agree without it ([`agreement`](crate::agreement)): if it ends after the begin, they do not need it.
+//! The participants agree without it ([`agreement`](crate::agreement)): after the begin they do not need it.
 
 use std::{collections::BTreeSet, time::Duration};
 

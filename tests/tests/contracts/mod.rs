@@ -1,7 +1,7 @@
 //! Contracts of two whole nodes: they are reported with the output that they are about, and close or do not.
 
 use std::sync::{
-    Arc, Mutex,
+    Arc, Mutex, MutexGuard, PoisonError,
     atomic::{AtomicBool, Ordering},
 };
 
@@ -87,16 +87,21 @@ impl Handler<Delivery<Torque>> for Knee {
     fn handle(&mut self, _: Delivery<Torque>, _: &mut Self::Context) {}
 }
 
+/// A process lists all its outputs, and the nodes of two legs would have the same addresses.
+static ONE_LEG: Mutex<()> = Mutex::new(());
+
 /// A central node that commands a knee on another one, which has these contracts.
 struct Leg {
     central: Node,
     knee: Node,
     view: Arc<View>,
     sender: Sender,
+    _one_leg: MutexGuard<'static, ()>,
 }
 
 impl Leg {
     fn start(contracts: impl IntoIterator<Item = Contract>) -> Self {
+        let one_leg = ONE_LEG.lock().unwrap_or_else(PoisonError::into_inner);
         let network = Loopback::new();
         let quick =
             |builder: NodeBuilder| builder.configure(|config| config.ndl.period = Duration::from_millis(50));
@@ -110,7 +115,7 @@ impl Leg {
         let builder = quick(network.node("leg")).configure(|config| config.contracts.dry_run = true);
         let knee = builder.app(knee).app(test).start().expect("a node");
         all_run(&[&central, &knee]);
-        Self { central, knee, view, sender: sender.sender() }
+        Self { central, knee, view, sender: sender.sender(), _one_leg: one_leg }
     }
 
     fn report(&self, node: &Node) -> ContractsReport {
@@ -163,6 +168,7 @@ fn missing_contract_and_too_short_time_are_found() {
     let closure = leg.closure();
     assert_eq!(closure.gaps.len(), 1, "{:?}", closure.gaps);
     assert_eq!((&*closure.gaps[0].app, &*closure.gaps[0].sender), ("knee", "control"));
+    drop(leg);
     let leg = Leg::start([of_control(Duration::from_millis(1_104))]);
     let closure = leg.closure();
     assert_eq!(closure.gaps, []);

@@ -416,7 +416,7 @@ fn held_list_fits_a_node_with_short_messages() {
 }
 
 #[test]
-fn sender_that_waits_for_room_is_woken_when_the_slow_application_takes_messages() {
+fn sender_waits_for_room_at_a_slow_application() {
     run(async {
         // Given: everything on the way to the slow application is full, and a task that keeps one more message
         let (a, b, mut slow) = pair().await;

@@ -41,7 +41,8 @@ struct Current {
     agreement: Agreement,
     values: Values,
     bound: Duration,
-    /// Whether no other set may change the parameters: until the values apply, or the stated time without a known result.
+    /// Whether no other set may change the parameters: until the values apply, or until the stated time without a known
+    /// result.
     is_holding: bool,
     /// When an application without ticks applies the values.
     apply_at: Duration,
@@ -154,8 +155,8 @@ pub struct OwnPart {
 
 impl<T> Tuner<T> {
     /// Takes part in a transaction: checks the values, holds them, and accepts. `sent` is the time at which the
-    /// message was sent, with its maximum error; `None` if it is unknown. Repeated for the same transaction it returns its
-    /// state.
+    /// message was sent, with its maximum error; `None` if it is unknown. Repeated for the same transaction it returns
+    /// its state.
     ///
     /// # Errors
     /// The values are illegal, or the transaction cannot be agreed on. Nothing is held.

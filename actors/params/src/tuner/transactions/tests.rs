@@ -224,7 +224,7 @@ fn doubt_ends_by_itself() {
 }
 
 #[test]
-fn transaction_that_cannot_be_agreed_on_is_refused_at_once() {
+fn transaction_without_a_chance_is_refused_at_once() {
     let refusal = |change: fn(&mut ParameterTransaction), sent, now| {
         let mut one = transaction(2);
         change(&mut one);

@@ -280,7 +280,7 @@ fn gathered_messages_are_numbered_and_sent_again() {
 }
 
 #[test]
-fn full_buffer_is_written_without_a_single_frame_behind_it() {
+fn full_buffer_is_written_without_a_frame_behind() {
     // Given: many messages of a burst, of which one more than the buffer has room for would be written alone
     let limits = OutletLimits { queue_capacity: 200, queue_bytes: 1 << 20, ..LIMITS };
     let (outlet, wire, writes) = (SocketWriter::new(limits), Arc::new(Wire::default()), Arc::default());
