@@ -6,7 +6,7 @@ use crate::config::file::{COMMAND_KEYS, KEYS};
 const MARKERS: [&str; 2] = ["<!-- generated: begin -->", "<!-- generated: end -->"];
 /// Set, the files are written instead of compared.
 const UPDATE: &str = "UPDATE";
-const COMMAND: &str = "UPDATE=1 cargo test --workspace --lib -- config::check::reference";
+const TO_UPDATE: &str = "UPDATE=1 cargo test --workspace --lib -- config::check::reference";
 
 fn reference(file: &str) -> std::path::PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs/book/src/reference").join(file)
@@ -125,13 +125,13 @@ fn the_page_has_the_tables_of_the_code() {
     let (before, rest) = page.split_once(MARKERS[0]).expect("the generated part begins");
     let (_, after) = rest.split_once(MARKERS[1]).expect("the generated part ends");
     let expected = [before, MARKERS[0], "\n", &tables(), MARKERS[1], after].concat();
-    assert_eq!(updated(FILE, &expected), expected, "write it anew: {COMMAND}");
+    assert_eq!(updated(FILE, &expected), expected, "write it anew: {TO_UPDATE}");
 }
 
 #[test]
 fn the_complete_file_has_the_keys_of_the_code() {
     let expected = complete_file();
-    assert_eq!(updated("node.toml", &expected), expected, "write it anew: {COMMAND}");
+    assert_eq!(updated("node.toml", &expected), expected, "write it anew: {TO_UPDATE}");
 }
 
 #[test]
@@ -140,5 +140,5 @@ fn the_schema_has_the_keys_of_the_code() {
     let written = updated("node.schema.json", &format!("{expected:#}\n"));
     // The order of keys is that of serde_json, which a feature of it changes.
     let written: Value = serde_json::from_str(&written).expect("it is JSON");
-    assert!(written == expected, "write it anew: {COMMAND}");
+    assert!(written == expected, "write it anew: {TO_UPDATE}");
 }
