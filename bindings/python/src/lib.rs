@@ -8,6 +8,7 @@
 //! | `endpoint.rs` | an endpoint: each call begins one operation |
 //! | `registration.rs` | the registration of an endpoint |
 //! | `operation.rs` | an operation: a future that Python polls |
+//! | `parameters.rs` | parameters that the program serves |
 //! | `received.rs` | received messages, and their memory for numpy |
 //! | `guard.rs` | guards of outputs for protected payloads |
 //! | `codec.rs` | MessagePack to and from values of Python |
@@ -21,6 +22,7 @@ mod endpoint;
 mod errors;
 mod guard;
 mod operation;
+mod parameters;
 mod received;
 mod registration;
 mod schema;
@@ -92,9 +94,10 @@ mod _sinew {
         kind_of, now,
         operation::Operation,
         outcome_text,
+        parameters::{ParameterDeclarations, ParameterSet},
         received::{Memory, Received},
         registration::register,
-        schema::parse_schema,
+        schema::{make_schema, parse_schema},
         tid_of, tid_text,
     };
 }

@@ -13,7 +13,7 @@ use rustix::{
     event::{PollFd, PollFlags, Timespec, poll},
     io::Errno,
 };
-use sinew_client::{ApiError, AsyncEndpoint, BarrierError, EventLoop, SetTogetherError};
+use sinew_client::{ApiError, BarrierError, EventLoop, SetTogetherError};
 use sinew_runtime::{
     outcome::{MemberOutcome, Outcome},
     parameters::{PartOutcome, TransactionReport},
@@ -21,7 +21,9 @@ use sinew_runtime::{
     time::Time,
 };
 
-use crate::{endpoint::Core, errors, guard::check_callback, received::Received, seconds};
+use crate::{
+    endpoint::Core, errors, guard::check_callback, parameters::Registered, received::Received, seconds,
+};
 
 /// Longest sleep of a blocking call: a signal may interrupt another thread than the one that executes its handler.
 const SIGNAL_CHECK: Duration = Duration::from_millis(250);
@@ -35,7 +37,7 @@ pub(crate) enum Done {
     Resolved(Option<Tid>),
     Generation(u64),
     Together(TransactionReport),
-    Registered(Box<AsyncEndpoint>),
+    Registered(Box<Registered>),
 }
 
 /// Why an operation has failed.
@@ -107,7 +109,7 @@ impl Operation {
                 let parts = report.parts.into_iter().map(|part| (part.app, in_words(part.outcome)));
                 (format!("{:?}", report.verdict), parts.collect::<Vec<_>>()).into_py_any(py)
             }
-            Done::Registered(endpoint) => Core::new(*endpoint, self.events.clone()).into_py_any(py),
+            Done::Registered(registered) => Core::new(*registered, self.events.clone()).into_py_any(py),
         }
     }
 

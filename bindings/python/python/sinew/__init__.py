@@ -25,6 +25,7 @@ from ._aio import AsyncEndpoint
 from ._bag import Bag, BagMessage, bag
 from ._blocking import Endpoint
 from ._message import Message
+from ._parameters import parameter, parameters
 from ._protection import Guard, Protected
 from ._register import Registration, register
 from ._reports import (
@@ -38,6 +39,7 @@ from ._reports import (
     TransactionReport,
     Undelivered,
 )
+from ._structure import F32, I8, I16, I32, U8, U16, U32, U64
 from ._types import payload
 from ._values import BROADCAST, MemberOutcome, MessageClass, Outcome, Tid, group
 from .errors import (
@@ -73,6 +75,14 @@ __version__ = "0.1.0"
 
 __all__ = [
     "BROADCAST",
+    "F32",
+    "I8",
+    "I16",
+    "I32",
+    "U8",
+    "U16",
+    "U32",
+    "U64",
     "Applied",
     "AsyncEndpoint",
     "BadNameError",
@@ -123,6 +133,8 @@ __all__ = [
     "bag",
     "errors",
     "group",
+    "parameter",
+    "parameters",
     "payload",
     "register",
 ]

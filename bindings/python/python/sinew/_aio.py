@@ -349,6 +349,10 @@ class AsyncEndpoint:
         """Sets parameters of an application, all or none. Raises `ParameterError` with the reason if it refuses."""
         return await self._run(self._plans.set_parameters(app, values, within))
 
+    async def tick(self) -> None:
+        """Begins a turn of the loop that reads the parameters of this application, like `Endpoint.tick`."""
+        await self._run(self._plans.tick())
+
     async def set_together(
         self, sets: Mapping[str, Mapping[str, Any]], *, lead: float = LEAD, within: float = 2.0
     ) -> TransactionReport:

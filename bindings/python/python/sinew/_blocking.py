@@ -225,6 +225,14 @@ class Endpoint:
         """Sets parameters of an application, all or none. Raises `ParameterError` with the reason if it refuses."""
         return self._run(self._plans.set_parameters(app, values, within))
 
+    def tick(self) -> None:
+        """Begins a turn of the loop that reads the parameters of this application: sets that wait are applied now.
+
+        All values that the turn reads belong together. A program that serves parameters also receives, at least every
+        20 ms if it takes part in transactions.
+        """
+        self._run(self._plans.tick())
+
     def set_together(
         self, sets: Mapping[str, Mapping[str, Any]], *, lead: float = LEAD, within: float = 2.0
     ) -> TransactionReport:

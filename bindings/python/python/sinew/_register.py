@@ -9,7 +9,9 @@ from typing import Any, Generator, Iterable, Optional, Type, Union
 from . import _sinew
 from ._aio import AsyncEndpoint, drive
 from ._blocking import Endpoint
-from ._options import RegisterOptions
+from ._options import NamedType, RegisterOptions
+from ._parameters import native_set
+from ._structure import structure_of
 from ._types import kind_id, payload_type
 from .errors import NoNodeError
 
@@ -69,6 +71,9 @@ def register(
     socket: Union[str, os.PathLike[str], None] = None,
     requires: Iterable[str] = (),
     handles: Iterable[Union[str, type]] = (),
+    sends: Iterable[Union[str, type]] = (),
+    parameters: Any = None,
+    period: float = 0.0,
     events: Iterable[str] = (),
     deadline: float = 60.0,
     stall_timeout: float = 1.0,
@@ -83,8 +88,12 @@ def register(
     - `name`: unique on the node; without it the application has an address alone.
     - `socket`: the `lncl.socket` of the node's configuration. Without it, `$SINEW_SOCKET`.
     - `requires`: names, patterns and counts that have to be ready first, as in Rust: `["knee.drive", "camera ?2s"]`.
-    - `handles`: the types that the application handles or sends, by name or by class. Tools and recordings have their
-      names from here.
+    - `handles`: the types that the application handles, by name or by class. Tools and recordings have their names and
+      their structures from here.
+    - `sends`: the types that it sends, in the same way. Nodes compare the structure of a class with that of each receiver.
+    - `parameters`: an object of a class with `@sinew.parameters`, whose values the application serves.
+    - `period`: seconds of the loop that reads them and calls `tick` in each turn. 0.0: there is no loop, and values
+      change between two received messages.
     - `events`: "nodes" for messages of `sinew.NodeEvent`, "requirements" for those about its requirements.
     - `deadline`: seconds for the registration, with the wait for the requirements.
     - `stall_timeout`: seconds that a send waits while the node reads nothing.
@@ -107,7 +116,9 @@ def register(
     options: RegisterOptions = {
         "name": name,
         "requires": list(requires),
-        "handles": [_name_of(each) for each in handles],
+        "handles": [_named_type(each) for each in handles],
+        "sends": [_named_type(each) for each in sends],
+        "parameters": None if parameters is None else (native_set(parameters), float(period)),
         "node_events": "nodes" in wanted,
         "requirement_events": "requirements" in wanted,
         "deadline": float(deadline),
@@ -121,11 +132,11 @@ def register(
     return Registration(os.fspath(path), options)
 
 
-def _name_of(handled: Union[str, type]) -> str:
-    if isinstance(handled, str):
-        kind_id(handled)
-        return handled
-    properties = payload_type(handled)
+def _named_type(of: Union[str, type]) -> NamedType:
+    if isinstance(of, str):
+        kind_id(of)
+        return of, None
+    properties = payload_type(of)
     if properties is None:
-        raise TypeError(f"{handled.__name__} is no payload class: declare it with @sinew.payload, or give a name")
-    return properties.name
+        raise TypeError(f"{of.__name__} is no payload class: declare it with @sinew.payload, or give a name")
+    return properties.name, structure_of(of)
