@@ -18,6 +18,7 @@ use sinew_runtime::{
 
 use crate::{
     errors,
+    fork::Owner,
     guard::{OutputGuard, ProtectedType, check_callback, safe_function},
     operation::{Done, Failure, Operation, Running, gone},
     parameters::{AnyValue, Registered},
@@ -144,8 +145,7 @@ pub(crate) struct Core {
     endpoint: Arc<tokio::sync::Mutex<Option<Registered>>>,
     events: EventLoop,
     facts: Arc<Mutex<Facts>>,
-    /// The process that registered it: a child of `fork` has only a copy.
-    pid: u32,
+    owner: Owner,
 }
 
 /// The endpoint, for one operation.
@@ -171,7 +171,11 @@ impl DerefMut for Lease {
 impl Drop for Lease {
     fn drop(&mut self) {
         if let Some(Registered { endpoint, .. }) = &*self.endpoint {
-            *self.facts.lock().unwrap_or_else(PoisonError::into_inner) = Facts::of(endpoint);
+            let mut facts = self.facts.lock().unwrap_or_else(PoisonError::into_inner);
+            // All others change with a registration alone.
+            if facts.registrations != endpoint.registrations() {
+                *facts = Facts::of(endpoint);
+            }
         }
     }
 }
@@ -180,11 +184,11 @@ impl Core {
     pub(crate) fn new(registered: Registered, events: EventLoop) -> Self {
         let facts = Arc::new(Mutex::new(Facts::of(&registered.endpoint)));
         let endpoint = Arc::new(tokio::sync::Mutex::new(Some(registered)));
-        Self { endpoint, events, facts, pid: std::process::id() }
+        Self { endpoint, events, facts, owner: Owner::this_process() }
     }
 
     fn lease(&self, py: Python<'_>) -> PyResult<Lease> {
-        if self.pid != std::process::id() {
+        if self.owner.is_parent() {
             let text = "the endpoint belongs to the process that this one was forked from; register another one here";
             return Err(errors::named(py, "ForkedError", text));
         }
@@ -223,6 +227,15 @@ impl Core {
 
     fn facts<T>(&self, read: impl FnOnce(&Facts) -> T) -> T {
         read(&self.facts.lock().unwrap_or_else(PoisonError::into_inner))
+    }
+}
+
+impl Drop for Core {
+    fn drop(&mut self) {
+        // The end of a copy would close the connection of the parent.
+        if self.owner.is_parent() {
+            std::mem::forget(Arc::clone(&self.endpoint));
+        }
     }
 }
 
@@ -319,6 +332,17 @@ impl Core {
         self.begin_with_parameters(py, |registered| {
             Box::pin(async move { Ok(Done::Received(Arc::new(registered.receive().await?))) })
         })
+    }
+
+    /// Sends without a confirmation, and blocks until the message has room.
+    fn send_now(&self, py: Python<'_>, message: Outgoing) -> PyResult<()> {
+        self.send(py, message)?.run(py, None).map(drop)
+    }
+
+    /// Blocks until a message arrives, `timeout` seconds at most: a `Received`, or `None`.
+    #[pyo3(signature = (timeout=None))]
+    fn receive_now(&self, py: Python<'_>, timeout: Option<f64>) -> PyResult<Option<Py<PyAny>>> {
+        Ok(self.receive(py)?.run(py, timeout)?.map(|(received,)| received))
     }
 
     /// Begins a turn of the loop that reads the parameters.

@@ -11,6 +11,7 @@
 //! | `parameters.rs` | parameters that the program serves |
 //! | `received.rs` | received messages, and their memory for numpy |
 //! | `guard.rs` | guards of outputs for protected payloads |
+//! | `fork.rs` | copies in the child of a fork |
 //! | `codec.rs` | MessagePack to and from values of Python |
 //! | `schema.rs` | structures of payload types |
 //! | `bag.rs` | files of recordings |
@@ -20,6 +21,7 @@ mod bag;
 mod codec;
 mod endpoint;
 mod errors;
+mod fork;
 mod guard;
 mod operation;
 mod parameters;
@@ -89,6 +91,7 @@ mod _sinew {
         bag::BagReader,
         codec::{decode, encode},
         endpoint::Core,
+        fork::forked,
         group_tid,
         guard::OutputGuard,
         kind_of, now,

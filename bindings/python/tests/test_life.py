@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import multiprocessing
 import os
 import signal
@@ -83,6 +84,14 @@ def test_interpreter_ends_with_live_endpoints(node: Any, way: str, code: int) ->
         for name in ("first", "second", "third"):
             until_gone(me, name)
 
+
+ECHO = """
+import sys, sinew
+with sinew.register("echo", socket=sys.argv[1], direct="always") as me:
+    print("up", flush=True)
+    for message in me:
+        me.send(message.source, "life.number", {"value": message.value["value"]})
+"""
 
 RECEIVER = """
 import sys, sinew
@@ -241,6 +250,79 @@ def test_exit_of_a_forked_child_leaves_the_address_to_the_parent(node: Any) -> N
         other.send(parent.tid, Number(2))
         message = parent.receive(LONG)
         assert message is not None and message.value == Number(2)
+
+
+def test_end_of_copies_in_a_forked_child_has_no_effect(node: Any) -> None:
+    endpoint, other = node.register("parent").open(), node.register().open()
+    try:
+        other.send(endpoint.tid, Number(1))
+        found: List[Outcome] = []
+        asked = threading.Thread(target=lambda: found.append(other.send_confirmed(endpoint.tid, Number(2), within=LONG)))
+        assert endpoint.receive(LONG) is not None
+        asked.start()
+        message = endpoint.receive(LONG)
+        assert message is not None
+        child = os.fork()
+        if child == 0:
+            try:
+                message.settle(Outcome.FAILED)
+            except sinew.ForkedError:
+                del message, endpoint
+                gc.collect()
+                os._exit(42)
+            finally:
+                os._exit(1)
+        _, status = os.waitpid(child, 0)
+        assert os.waitstatus_to_exitcode(status) == 42
+        assert not found, "the message is in the hand of the parent"
+        message.settle(Outcome.REJECTED_BY_HANDLER)
+        asked.join(LONG)
+        assert found == [Outcome.REJECTED_BY_HANDLER]
+        assert endpoint.receive(0.05) is None and endpoint.registrations == 1
+    finally:
+        endpoint.close()
+        other.close()
+
+
+def test_direct_link_carries_all_that_a_node_carries(node: Any) -> None:
+    with node.register("one", direct="always") as one, node.register("other", direct="always") as other:
+        for turn in range(2_000):
+            other.send(one.tid, Number(turn))
+            message = one.receive(LONG)
+            assert message is not None and message.value == Number(turn) and message.source == other.tid
+        # More than a ring holds: each waits for room, and arrives in order.
+        blocks = 500
+        sender = threading.Thread(
+            target=lambda: [
+                other.send(one.tid, "life.block", bytes([turn % 256]) * 20_000, class_="bulk", room_within=LONG)
+                for turn in range(blocks)
+            ]
+        )
+        sender.start()
+        for turn in range(blocks):
+            message = one.receive(LONG)
+            assert message is not None and message.data == bytes([turn % 256]) * 20_000
+        sender.join(LONG)
+    with pytest.raises(ValueError, match='direct is "sometimes"'):
+        node.register("one", direct="sometimes").open()
+
+
+def test_direct_link_ends_with_its_peer(node: Any) -> None:
+    process = start(ECHO, node.socket)
+    try:
+        with node.register("one", direct="always") as one:
+            to = one.resolve("echo")
+            assert to is not None
+            for turn in range(500):
+                one.send(to, Number(turn))
+                message = one.receive(LONG)
+                assert message is not None and message.value == Number(turn)
+            process.send_signal(signal.SIGKILL)
+            process.wait(LONG)
+            until_gone(one, "echo")
+            assert one.send_confirmed(to, Number(1), within=LONG) is Outcome.REJECTED_NO_SUCH_APPLICATION
+    finally:
+        end(process)
 
 
 async def wait_for_all(me: sinew.AsyncEndpoint, tasks: List[asyncio.Task[Any]]) -> None:

@@ -20,7 +20,9 @@ A Python process is an application apart: a pause of the GIL stalls this applica
 
 from __future__ import annotations
 
-from . import errors
+import os as _os
+
+from . import _sinew, errors
 from ._aio import AsyncEndpoint
 from ._bag import Bag, BagMessage, bag
 from ._blocking import Endpoint
@@ -72,6 +74,9 @@ from .errors import (
 )
 
 __version__ = "0.1.0"
+
+# The child has only copies of endpoints and messages.
+_os.register_at_fork(after_in_child=_sinew.forked)
 
 __all__ = [
     "BROADCAST",
