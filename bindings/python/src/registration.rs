@@ -3,7 +3,7 @@
 use std::{path::PathBuf, time::Duration};
 
 use pyo3::{exceptions::PyValueError, prelude::*};
-use sinew_client::{EventLoop, NodeApi, Registration, Transport};
+use sinew_client::{DirectLinks, EventLoop, NodeApi, Registration, Transport};
 use sinew_model::facts::NodeEvent;
 use sinew_runtime::{app::RequirementEvent, tid::AppAddress};
 use sinew_schema::Schema;
@@ -38,6 +38,7 @@ pub(crate) struct Options {
     socket_only: bool,
     reconnect: bool,
     own_user_only: bool,
+    direct: String,
 }
 
 /// The name of a type, and the canonical bytes of its structure if that is known.
@@ -81,6 +82,15 @@ impl Options {
         if self.requirement_events {
             registration = registration.subscribe::<RequirementEvent>();
         }
+        registration = registration.direct(match self.direct.as_str() {
+            "automatic" => DirectLinks::Automatic,
+            "always" => DirectLinks::Always,
+            "never" => DirectLinks::Never,
+            other => {
+                let text = format!("direct is {other:?}: take \"automatic\", \"always\" or \"never\"");
+                return Err(PyValueError::new_err(text));
+            }
+        });
         if self.socket_only {
             registration = registration.transport(Transport::Socket);
         }

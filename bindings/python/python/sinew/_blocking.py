@@ -83,7 +83,7 @@ class Endpoint:
         A name is looked up with each call: in a loop `resolve` it once.
         """
         options = Options(class_, room_within, expires_after)
-        self._run(self._plans.send(outgoing(to, what, value, options)))
+        self._core.send_now(outgoing(to, what, value, options))
 
     def send_confirmed(
         self,
@@ -124,8 +124,8 @@ class Endpoint:
         Control messages are first, then Stream, of which only the newest value of each source and type is kept, then Bulk.
         Raises `DisconnectedError` once when the node has gone; later calls wait for its return.
         """
-        done = self._core.receive().run(within)
-        return None if done is None else Message(done[0])
+        received = self._core.receive_now(within)
+        return None if received is None else Message(received)
 
     def __iter__(self) -> Iterator[Message]:
         while True:

@@ -28,6 +28,7 @@ class RegisterOptions(TypedDict):
     socket_only: bool
     reconnect: bool
     own_user_only: bool
+    direct: str
 
 
 class ProtectedOptions(TypedDict):

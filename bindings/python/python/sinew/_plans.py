@@ -65,7 +65,8 @@ def outgoing(to: Destination, what: Any, value: Any, options: Options = DEFAULT)
     if isinstance(what, str):
         kind, number, expires = kind_id(what), 0, None
         content = {} if value is _NOTHING else value
-        properties = payload_type(class_of_kind(kind))
+        cls = class_of_kind(kind)
+        properties = None if cls is None else payload_type(cls)
     else:
         if value is not _NOTHING:
             raise TypeError("give the name of a type and its value, or one value of a payload class")

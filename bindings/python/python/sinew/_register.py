@@ -7,7 +7,7 @@ from types import TracebackType
 from typing import Any, Generator, Iterable, Optional, Type, Union
 
 from . import _sinew
-from ._aio import AsyncEndpoint, drive
+from ._aio import AsyncEndpoint, begin
 from ._blocking import Endpoint
 from ._options import NamedType, RegisterOptions
 from ._parameters import native_set
@@ -37,7 +37,7 @@ class Registration:
 
     async def open_async(self) -> AsyncEndpoint:
         """Registers in the running event loop, and waits until all requirements are ready."""
-        return AsyncEndpoint(await drive(_sinew.register(self._socket, self._options)))
+        return await begin(_sinew.register(self._socket, self._options))
 
     def __await__(self) -> Generator[Any, Any, AsyncEndpoint]:
         return self.open_async().__await__()
@@ -82,6 +82,7 @@ def register(
     socket_only: bool = False,
     reconnect: bool = True,
     own_user_only: bool = False,
+    direct: str = "automatic",
 ) -> Registration:
     """Registers an application at the node of this host.
 
@@ -101,6 +102,8 @@ def register(
     - `address`: a fixed address, else a dynamic one.
     - `socket_only`: no rings in shared memory.
     - `reconnect`: whether the endpoint registers again when its node was restarted.
+    - `direct`: links to other processes that bypass the node, in shared memory: "automatic" with frequent peers, "always"
+      from the first message on, "never".
     - `own_user_only`: trust only a node of this user, or of root. For a socket in a folder that others can write.
 
         async with sinew.register("tuner", requires=["knee.drive"]) as me: ...
@@ -128,6 +131,7 @@ def register(
         "socket_only": socket_only,
         "reconnect": reconnect,
         "own_user_only": own_user_only,
+        "direct": direct,
     }
     return Registration(os.fspath(path), options)
 
