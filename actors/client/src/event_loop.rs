@@ -139,15 +139,15 @@ impl EventLoop {
         self.poll_first(future)
     }
 
-    /// Polls a future of the endpoint for the first time, without the system call that takes the events before this poll.
-    /// If the future is not ready, an event from before causes one needless poll.
+    /// Polls a future of the endpoint for the first time, without the system call that takes the events before it. If
+    /// the future is not ready, an event from before causes one needless poll.
     pub fn poll_first<F: Future + ?Sized>(&self, future: Pin<&mut F>) -> Poll<F::Output> {
         self.0.wake_at.store(Time::MAX.as_nanos(), Ordering::Relaxed);
         let waker = Waker::from(Arc::clone(&self.0));
         future.poll(&mut Context::from_waker(&waker))
     }
 
-    /// Blocks until the descriptor is readable, for this time at most, and takes the events: for a thread that then calls
+    /// Blocks until the descriptor is readable, for this time at most, and takes the events. Then the thread calls
     /// [`poll_first`](Self::poll_first). Returns early after a signal.
     ///
     /// # Errors

@@ -90,8 +90,8 @@ impl Descriptor {
         self.description.split_whitespace().collect::<Vec<_>>().join(" ")
     }
 
-    /// Returns the reason why this declaration is not legal: the name is too long, the default is outside of its range, or
-    /// the slope is not positive. `None`: it is legal.
+    /// Returns the reason why this declaration is not legal: the name is too long, the default is outside of its range,
+    /// or the slope is not positive. `None`: it is legal.
     #[must_use]
     pub const fn fault(&self) -> Option<&'static str> {
         const OUT_OF_RANGE: &str = "the default of a parameter is in its range";

@@ -63,7 +63,7 @@ pub(crate) type Running<'e> = Pin<Box<dyn Future<Output = Ended> + Send + 'e>>;
 pub(crate) struct Operation {
     future: Mutex<Option<Running<'static>>>,
     events: EventLoop,
-    /// Whether the events are to be taken before the next poll: not before the first one, and not after a blocking wait.
+    /// Whether events are to be taken before the next poll: not before the first one, and not after a blocking wait.
     has_events: AtomicBool,
     owner: Owner,
 }
