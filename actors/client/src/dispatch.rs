@@ -215,7 +215,6 @@ impl Endpoint {
             match self.wait_mode {
                 WaitMode::Blocking => self.direct.await_room(room, pause.min(until.since(now))),
                 // Woken for room and for incoming messages.
-                // One on another event loop has no direct link.
                 WaitMode::Async(_) | WaitMode::Polled(_) => self.wait_for_room(room, until, now).await,
             }
             pause = (pause * 2).min(CHECK_INTERVAL);

@@ -327,7 +327,7 @@ impl Endpoint {
         // never waits would always be late because of frames that are not for the program.
         let mut left = None;
         loop {
-            if let WaitMode::Async(_) = self.wait_mode {
+            if !matches!(self.wait_mode, WaitMode::Blocking) {
                 let arrived = self.look(now);
                 match self.take_only(arrived, now) {
                     Only::Received(received) => return Ok(Some(received)),

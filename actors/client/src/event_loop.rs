@@ -14,8 +14,8 @@ use std::{
     path::Path,
     pin::{Pin, pin},
     sync::{
-        Arc,
-        atomic::{AtomicU64, Ordering},
+        Arc, Mutex,
+        atomic::{AtomicBool, AtomicU64, Ordering},
     },
     task::{Context, Poll, Wake, Waker},
     time::Duration,
@@ -25,21 +25,24 @@ use rustix::{
     event::{EventfdFlags, PollFd, PollFlags, Timespec, epoll, eventfd, poll},
     io::Errno,
 };
-use sinew_runtime::time::Time;
+use sinew_runtime::{lock, time::Time};
 use sinew_shm::{Armed, BellKind};
 
 use super::{
-    ApiError, AsyncEndpoint, DirectLinks, Endpoint, Registration,
-    link::{
-        Link, Reader, RegistrationHandshake, Writer,
-        ring::{self, Rest},
-        socket::has_hung_up,
-    },
+    ApiError, AsyncEndpoint, Endpoint, Registration,
+    direct::{Direct, Room},
+    link::{Link, Reader, RegistrationHandshake, Writer, ring::Rest, socket::has_hung_up},
+    reactor::{Listening, Until},
+    routes::LinkNumber,
     wait_mode::WaitMode,
 };
 
-/// Descriptors of an endpoint: two bells, the socket to the node, and the waker's.
-const EVENTS_MAX: usize = 8;
+/// The sources of events: a bell or a waker, or a socket that may have hung up.
+const BELL: u64 = 0;
+const SOCKET: u64 = 1;
+/// Maximum number of events that one poll takes: those of an endpoint without direct links (two bells, the socket to
+/// the node, the waker's), and of some links. Further ones cost one more poll.
+const EVENTS_MAX: usize = 16;
 
 /// Runs the futures of one [`AsyncEndpoint`] on an event loop that is not tokio's, without a thread.
 ///
@@ -84,6 +87,10 @@ struct Shared {
     woken: OwnedFd,
     /// The latest time of the next poll, in nanoseconds.
     wake_at: AtomicU64,
+    /// Whether an event on a socket was taken that no wait has looked at.
+    has_socket_event: AtomicBool,
+    /// The direct links with watched descriptors.
+    links: Mutex<Vec<LinkNumber>>,
 }
 
 impl Wake for Shared {
@@ -112,8 +119,14 @@ impl EventLoop {
         let epoll = epoll::create(epoll::CreateFlags::CLOEXEC)?;
         let woken = eventfd(0, EventfdFlags::CLOEXEC | EventfdFlags::NONBLOCK)?;
         let wake_at = AtomicU64::new(Time::MAX.as_nanos());
-        let events = Self(Arc::new(Shared { epoll, woken, wake_at }));
-        events.watch(events.0.woken.as_fd(), epoll::EventFlags::IN)?;
+        let events = Self(Arc::new(Shared {
+            epoll,
+            woken,
+            wake_at,
+            links: Mutex::default(),
+            has_socket_event: AtomicBool::new(false),
+        }));
+        events.watch(events.0.woken.as_fd(), epoll::EventFlags::IN, BELL)?;
         Ok(events)
     }
 
@@ -122,11 +135,36 @@ impl EventLoop {
     pub fn poll<F: Future + ?Sized>(&self, future: Pin<&mut F>) -> Poll<F::Output> {
         // Takes the events, so that the descriptor is readable again only after a new one. An error leaves it readable,
         // which costs a needless poll.
-        let at_once = Timespec { tv_sec: 0, tv_nsec: 0 };
-        let _ = epoll::wait(&self.0.epoll, &mut [MaybeUninit::uninit(); EVENTS_MAX], Some(&at_once));
+        let _ = self.take_events(Duration::ZERO);
+        self.poll_first(future)
+    }
+
+    /// Polls a future of the endpoint for the first time, without the system call that takes the events before it. If
+    /// the future is not ready, an event from before causes one needless poll.
+    pub fn poll_first<F: Future + ?Sized>(&self, future: Pin<&mut F>) -> Poll<F::Output> {
         self.0.wake_at.store(Time::MAX.as_nanos(), Ordering::Relaxed);
         let waker = Waker::from(Arc::clone(&self.0));
         future.poll(&mut Context::from_waker(&waker))
+    }
+
+    /// Blocks until the descriptor is readable, for this time at most, and takes the events. Then the thread calls
+    /// [`poll_first`](Self::poll_first). Returns early after a signal.
+    ///
+    /// # Errors
+    /// The descriptor is none any more.
+    pub fn take_events(&self, within: Duration) -> io::Result<()> {
+        // A longer time than a timespec has is as good as any.
+        let left = Timespec::try_from(within).ok();
+        match epoll::wait(&self.0.epoll, &mut [MaybeUninit::uninit(); EVENTS_MAX], left.as_ref()) {
+            Ok((events, _)) => {
+                if events.iter().any(|event| event.data.u64() == SOCKET) {
+                    self.0.has_socket_event.store(true, Ordering::Relaxed);
+                }
+                Ok(())
+            }
+            Err(Errno::INTR) => Ok(()),
+            Err(why) => Err(why.into()),
+        }
     }
 
     /// Returns the time until the next poll of the last future, even if the descriptor is not readable by then; `None`:
@@ -138,8 +176,8 @@ impl EventLoop {
     }
 
     /// Reports each event on a descriptor once. A descriptor that is closed leaves the set.
-    fn watch(&self, fd: BorrowedFd<'_>, events: epoll::EventFlags) -> io::Result<()> {
-        let data = epoll::EventData::new_u64(0);
+    fn watch(&self, fd: BorrowedFd<'_>, events: epoll::EventFlags, source: u64) -> io::Result<()> {
+        let data = epoll::EventData::new_u64(source);
         match epoll::add(&self.0.epoll, fd, data, events | epoll::EventFlags::ET) {
             // The socket of a registration is that of its link.
             Ok(()) | Err(Errno::EXIST) => Ok(()),
@@ -147,26 +185,54 @@ impl EventLoop {
         }
     }
 
-    /// Watches the descriptors of a link.
+    /// Watches exactly the open direct links, and the room signal that is waited for.
+    fn follow(&self, direct: &mut Direct, room: Option<Room>) {
+        let mut links = lock(&self.0.links);
+        links.retain(|number| direct.open.iter().any(|link| link.number == *number));
+        for link in &direct.open {
+            if !links.contains(&link.number) {
+                // A link that cannot be watched is polled each `CHECK_INTERVAL`, as all are.
+                let _ = link.bell().map(|bell| self.watch(bell, epoll::EventFlags::IN, BELL));
+                let _ = self.watch_socket(link.socket());
+                links.push(link.number);
+            }
+        }
+        if let Some(Room { link, .. }) = room {
+            direct
+                .with_room_bell(link, |bell| bell.map(|bell| self.watch(bell, epoll::EventFlags::IN, BELL)));
+        }
+    }
+
+    /// Watches the descriptors of a link to a node.
     pub(super) fn watch_link(&self, reader: &Reader, writer: &Writer) -> io::Result<()> {
+        // An address that has changed has other links.
+        lock(&self.0.links).clear();
         let no_bell = || io::Error::from(io::ErrorKind::Unsupported);
         match (reader, writer) {
             (Reader::Ring(reader), Writer::Ring(writer)) => {
-                self.watch(reader.bell().ok_or_else(no_bell)?, epoll::EventFlags::IN)?;
-                writer.with_bell(|bell| self.watch(bell.ok_or_else(no_bell)?, epoll::EventFlags::IN))?;
+                self.watch(reader.bell().ok_or_else(no_bell)?, epoll::EventFlags::IN, BELL)?;
+                writer
+                    .with_bell(|bell| self.watch(bell.ok_or_else(no_bell)?, epoll::EventFlags::IN, BELL))?;
                 self.watch_socket(&reader.socket())
             }
-            (Reader::Socket(reader), _) => self.watch(reader.fd(), both_ways()),
+            (Reader::Socket(reader), _) => self.watch(reader.fd(), both_ways(), SOCKET),
             (Reader::Ring(_), Writer::Socket(_)) => unreachable!("both are of one link"),
         }
     }
 
     fn watch_socket(&self, socket: &UnixStream) -> io::Result<()> {
-        self.watch(socket.as_fd(), both_ways())
+        self.watch(socket.as_fd(), both_ways(), SOCKET)
     }
 
-    /// Waits until something may have arrived or is to be done, until `deadline` at most. May end early.
-    pub(super) async fn wait(&self, reader: &mut Reader, writer: &Writer, deadline: Time) {
+    /// Waits until something may have arrived or is to be done, or the requested room, until the deadline at most. May
+    /// end early.
+    pub(super) async fn wait(
+        &self,
+        reader: &mut Reader,
+        writer: &Writer,
+        direct: &mut Direct,
+        Until { deadline, room }: Until,
+    ) {
         match reader {
             Reader::Socket(socket) => {
                 if !is_ready(socket.fd(), PollFlags::IN) {
@@ -174,17 +240,38 @@ impl EventLoop {
                 }
             }
             Reader::Ring(reader) => {
-                let listening = Listening(reader);
-                if listening.0.arm() == Armed::Ready {
-                    return;
-                }
-                // Its event may have been taken by a poll that did not look at the socket.
-                if has_hung_up(&listening.0.socket()) {
-                    return listening.0.check_at_once();
+                self.follow(direct, room);
+                let socket = reader.socket();
+                let Some(mut listening) = Listening::begin(Some(reader), direct, room) else { return };
+                // An event on the socket of the node, or of a link, that a poll has taken without a look at the socket.
+                if self.0.has_socket_event.swap(false, Ordering::Relaxed) {
+                    if has_hung_up(&socket) {
+                        listening.check_at_once();
+                    }
+                    drop(listening);
+                    return direct.on_wake(true);
                 }
                 self.sleep(writer, deadline).await;
             }
         }
+    }
+
+    /// The same while there is no node: for direct links alone.
+    pub(super) async fn wait_for_links(&self, direct: &mut Direct, Until { deadline, room }: Until) {
+        self.follow(direct, room);
+        let Some(_listening) = Listening::begin(None, direct, room) else { return };
+        self.until_polled(deadline, |_| Poll::Pending).await;
+    }
+
+    /// Waits for room on a direct link alone: no further incoming messages can be read.
+    pub(super) async fn wait_for_room(&self, direct: &mut Direct, room: Room, deadline: Time) {
+        self.follow(direct, Some(room));
+        if direct.arm_room(room) == Armed::Ready {
+            return;
+        }
+        // Not disarmed if this is dropped: the peer may cause one needless wake.
+        self.until_polled(deadline, |_| Poll::Pending).await;
+        direct.disarm_room(room);
     }
 
     /// Waits until there may be room for a frame of `length` bytes, or for the rest of one, until `deadline` at most.
@@ -235,15 +322,6 @@ impl EventLoop {
     }
 }
 
-/// A reader that has announced its sleep. Dropping it records that the task is awake.
-struct Listening<'a>(&'a mut ring::Reader);
-
-impl Drop for Listening<'_> {
-    fn drop(&mut self) {
-        self.0.disarm();
-    }
-}
-
 fn both_ways() -> epoll::EventFlags {
     epoll::EventFlags::IN | epoll::EventFlags::OUT | epoll::EventFlags::RDHUP
 }
@@ -283,8 +361,6 @@ impl AsyncEndpoint {
         events: EventLoop,
     ) -> Result<Self, ApiError> {
         registration.link.bell = BellKind::Socket.into();
-        // Each link would be three more descriptors, and saves less than such an event loop takes.
-        registration.link.direct_links = DirectLinks::Never;
         let link = registration.register_on(path, &events).await?;
         let watched = events.watch_link(&link.reader, &link.writer);
         watched.map_err(|why| ApiError::Closed(why.to_string()))?;

@@ -274,10 +274,10 @@ impl Endpoint {
             };
         }
         let deadline = self.wake_by(deadline, now, None);
+        let until = Until { deadline, room: None };
         match &mut self.wait_mode {
             WaitMode::Blocking => _ = self.block(deadline.since(now)),
             WaitMode::Async(reactor) => {
-                let until = Until { deadline, room: None };
                 yield_if_ready(reactor.wait(
                     &mut self.node.reader,
                     &self.node.writer,
@@ -287,7 +287,13 @@ impl Endpoint {
                 .await;
             }
             WaitMode::Polled(events) => {
-                yield_if_ready(events.wait(&mut self.node.reader, &self.node.writer, deadline)).await;
+                yield_if_ready(events.wait(
+                    &mut self.node.reader,
+                    &self.node.writer,
+                    &mut self.direct,
+                    until,
+                ))
+                .await;
             }
         }
     }
@@ -302,15 +308,19 @@ impl Endpoint {
     /// links alone.
     pub(super) async fn wait_for_room(&mut self, room: Room, deadline: Time, now: Time) {
         let deadline = self.wake_by(deadline, now, Some(room.link)).min(now + CHECK_INTERVAL);
-        let WaitMode::Async(reactor) = &mut self.wait_mode else { return };
         let until = Until { deadline, room: Some(room) };
-        if !self.inbox.has_room() {
-            // Messages that wait in a ring would end each wait at once.
-            reactor.wait_for_room(&mut self.direct, room, deadline).await;
-        } else if self.node.ended.is_some() || self.node.reader.has_ended(now) {
-            reactor.wait_for_links(&mut self.direct, until).await;
-        } else {
-            reactor.wait(&mut self.node.reader, &self.node.writer, &mut self.direct, until).await;
+        // Messages that wait in a ring would end each wait at once.
+        let has_room = self.inbox.has_room();
+        let has_node = self.node.ended.is_none() && !self.node.reader.has_ended(now);
+        let (reader, writer, direct) = (&mut self.node.reader, &self.node.writer, &mut self.direct);
+        match &mut self.wait_mode {
+            WaitMode::Blocking => {}
+            WaitMode::Async(reactor) if !has_room => reactor.wait_for_room(direct, room, deadline).await,
+            WaitMode::Async(reactor) if !has_node => reactor.wait_for_links(direct, until).await,
+            WaitMode::Async(reactor) => reactor.wait(reader, writer, direct, until).await,
+            WaitMode::Polled(events) if !has_room => events.wait_for_room(direct, room, deadline).await,
+            WaitMode::Polled(events) if !has_node => events.wait_for_links(direct, until).await,
+            WaitMode::Polled(events) => events.wait(reader, writer, direct, until).await,
         }
     }
 

@@ -134,9 +134,9 @@ impl NodeApi {
         AsyncEndpoint::register(&self.path, self.asking(registration)).await
     }
 
-    /// The same for the event loop of another library, without tokio and without a thread. The endpoint has no direct
-    /// links. `events` is for this endpoint alone. Only the connection to the node's socket may block, up to 2 s, while
-    /// its queue of new connections is full.
+    /// The same for the event loop of another library, without tokio. The only threads are the short ones that make the
+    /// rings of direct links. `events` is for this endpoint alone. Only the connection to the node's socket may block,
+    /// up to 2 s, while its queue of new connections is full.
     ///
     /// # Errors
     /// Same as [`register_transport_address`](Self::register_transport_address).

@@ -51,8 +51,7 @@ impl Endpoint {
         }
         match self.wait_mode {
             WaitMode::Blocking => self.node.reader.look(now),
-            WaitMode::Async(_) => self.look_at_rings(now),
-            WaitMode::Polled(_) => None,
+            WaitMode::Async(_) | WaitMode::Polled(_) => self.look_at_rings(now),
         }
     }
 
@@ -92,8 +91,10 @@ impl Endpoint {
                 Some(index) => self.take_only_of(index, now),
                 None => Only::Other,
             },
-            (Some(Arrived::Only(index)), WaitMode::Async(_)) => self.take_only_of(index.into(), now),
-            (Some(Arrived::Several | Arrived::Only(_)) | None, _) => Only::Other,
+            (Some(Arrived::Only(index)), WaitMode::Async(_) | WaitMode::Polled(_)) => {
+                self.take_only_of(index.into(), now)
+            }
+            (Some(Arrived::Several) | None, _) => Only::Other,
         }
     }
 

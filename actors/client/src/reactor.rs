@@ -293,7 +293,7 @@ async fn spin_until_arrival(
 }
 
 /// The announced sleepers: the readers, and the sender that waits for room. Dropping it disarms them.
-struct Listening<'a> {
+pub(super) struct Listening<'a> {
     node: Option<&'a mut ring::Reader>,
     direct: &'a mut Direct,
     room: Option<Room>,
@@ -301,7 +301,11 @@ struct Listening<'a> {
 
 impl<'a> Listening<'a> {
     /// Announces the sleep. Returns `None` if there is something to do already.
-    fn begin(node: Option<&'a mut ring::Reader>, direct: &'a mut Direct, room: Option<Room>) -> Option<Self> {
+    pub(super) fn begin(
+        node: Option<&'a mut ring::Reader>,
+        direct: &'a mut Direct,
+        room: Option<Room>,
+    ) -> Option<Self> {
         let mut listening = Self { node, direct, room };
         let Self { node, direct, room } = &mut listening;
         let is_silent = node.as_mut().is_none_or(|node| node.arm() == Armed::Sleep)
@@ -311,7 +315,7 @@ impl<'a> Listening<'a> {
     }
 
     /// Makes the next poll check the node's socket.
-    fn check_at_once(&mut self) {
+    pub(super) fn check_at_once(&mut self) {
         if let Some(node) = &mut self.node {
             node.check_at_once();
         }

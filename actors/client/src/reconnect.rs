@@ -25,8 +25,9 @@ use super::{
     ApiError, Endpoint,
     direct::{Direct, Terms},
     endpoint::LNCL,
-    link::{Ended, Link, LinkOptions, RegistrationHandshake, Writer},
+    link::{Ended, Link, LinkOptions, RegistrationHandshake, Writer, ring::CHECK_INTERVAL},
     node_link::NodeLink,
+    reactor::Until,
     requests::Requests,
     wait_mode::WaitMode,
 };
@@ -270,7 +271,12 @@ impl Endpoint {
         let due = if attempt.handshake.is_some() { now + PAUSE.0 } else { attempt.next };
         let until = due.min(deadline);
         if let WaitMode::Polled(events) = &self.wait_mode {
-            events.until_polled(until, |_| Poll::Pending).await;
+            if has_links {
+                let deadline = self.direct.wake_by(until.min(now + CHECK_INTERVAL), now, None);
+                events.wait_for_links(&mut self.direct, Until { deadline, room: None }).await;
+            } else {
+                events.until_polled(until, |_| Poll::Pending).await;
+            }
         } else if has_links {
             self.direct.wait(until.since(Time::now()));
         } else {

@@ -8,11 +8,12 @@ use sinew_runtime::{
     time::Time,
     wire::{Kind, Payload, PayloadType},
 };
+use sinew_schema::Schema;
 use sinew_shm::{BellKind, Spin};
 
 use super::{
     ApiError, DirectLinks, Transport, direct,
-    link::{Link, LinkOptions, RegistrationHandshake, ServerTrust, Use, UsedTypes},
+    link::{Link, LinkOptions, RegistrationHandshake, ServerTrust, TypeOf, Use, UsedTypes},
     reconnect::ReconnectPolicy,
 };
 
@@ -164,7 +165,7 @@ impl Registration {
         }
         // Without an entry the structure is not declared, and messages of the type are not compared.
         if let Some(of) = PayloadType::of::<P>() {
-            self.link.types.add(of, as_what);
+            self.link.types.add(TypeOf::Rust(of), as_what);
         }
         self
     }
@@ -174,6 +175,41 @@ impl Registration {
     #[must_use]
     pub fn handles_named(mut self, name: impl Into<String>) -> Self {
         self.register.kinds.push(name.into());
+        self
+    }
+
+    /// Declares a type without a Rust definition that the application handles, with its structure. Like
+    /// [`handles`](Self::handles), but for messages of another version of the type: they are logged, and the program
+    /// decides on each.
+    #[must_use]
+    pub fn handles_structure(self, name: &str, structure: &Schema) -> Self {
+        self.given(name, structure, Use::Handled)
+    }
+
+    /// Declares a type without a Rust definition that the application sends, with its structure. Like
+    /// [`sends`](Self::sends).
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::Registration;
+    /// use sinew_schema::{Field, Schema, Shape};
+    ///
+    /// let degrees = Field { name: "degrees".to_owned(), shape: Shape::F64, optional: false };
+    /// let angle = Schema { root: Shape::Struct(vec![degrees]), types: Default::default() };
+    /// let sensor = Registration::new().name("knee.sensor").sends_structure("demo.angle", &angle);
+    /// ```
+    #[must_use]
+    pub fn sends_structure(self, name: &str, structure: &Schema) -> Self {
+        self.given(name, structure, Use::Sent)
+    }
+
+    fn given(mut self, name: &str, structure: &Schema, as_what: Use) -> Self {
+        if !self.register.kinds.iter().any(|known| known == name) {
+            self.register.kinds.push(name.to_owned());
+        }
+        let given = TypeOf::Given { name: name.to_owned(), schema: structure.encode() };
+        self.link.types.add(given, as_what);
         self
     }
 

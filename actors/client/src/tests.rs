@@ -57,6 +57,7 @@ macro_rules! on_every_transport {
         on_every_transport!(@async_direct Ring Task true, $($claim)* $($($rust)*)?);
         on_every_transport!(@async_socket Socket Task false, $($claim)* $($($rust)*)?);
         on_every_transport!(@polled_ring Ring Polled false, $($claim)* $($($rust)*)?);
+        on_every_transport!(@polled_direct Ring Polled true, $($claim)* $($($rust)*)?);
         on_every_transport!(@polled_socket Socket Polled false, $($claim)* $($($rust)*)?);
         on_every_transport!(@c_ring Ring C false, $($claim)*);
         on_every_transport!(@c_direct Ring C true, $($claim)*);

@@ -90,6 +90,32 @@ impl Descriptor {
         self.description.split_whitespace().collect::<Vec<_>>().join(" ")
     }
 
+    /// Returns the reason why this declaration is not legal: the name is too long, the default is outside of its range,
+    /// or the slope is not positive. `None`: it is legal.
+    #[must_use]
+    pub const fn fault(&self) -> Option<&'static str> {
+        const OUT_OF_RANGE: &str = "the default of a parameter is in its range";
+        if self.name.len() > NAME_BYTES_MAX {
+            return Some("the name of a parameter has at most 63 bytes");
+        }
+        match self.domain {
+            Domain::Number { min, max, .. } if !(min.is_finite() && max.is_finite()) => {
+                Some("both ends of a range are finite numbers")
+            }
+            // False for NaN.
+            Domain::Number { default, min, max, .. } if !(min <= default && default <= max) => {
+                Some(OUT_OF_RANGE)
+            }
+            Domain::Number { slope_per_s: Some(slope), .. } if !(slope.is_finite() && slope > 0.0) => {
+                Some("a slope is greater than zero, in units per second")
+            }
+            Domain::Integer { default, min, max } if !(min <= default && default <= max) => {
+                Some(OUT_OF_RANGE)
+            }
+            Domain::Number { .. } | Domain::Integer { .. } | Domain::Flag { .. } => None,
+        }
+    }
+
     pub(crate) fn value_of(&self, bits: u64) -> Value {
         match self.domain {
             Domain::Number { .. } => Value::Number(f64::from_bits(bits)),
@@ -102,29 +128,13 @@ impl Descriptor {
 /// Checks the declarations of one application. `params!` calls it when the program is compiled.
 ///
 /// # Panics
-/// There are too many, a name is too long, a default is outside of its range, or a slope is not positive.
+/// There are too many, or one is not legal: see [`Descriptor::fault`].
 pub const fn check(descriptors: &[Descriptor]) {
     assert!(descriptors.len() <= PARAMETERS_MAX, "an application has at most 64 parameters");
     let mut at = 0;
     while at < descriptors.len() {
-        let Descriptor { name, domain, .. } = descriptors[at];
-        assert!(name.len() <= NAME_BYTES_MAX, "the name of a parameter has at most 63 bytes");
-        match domain {
-            Domain::Number { default, min, max, slope_per_s } => {
-                assert!(min.is_finite() && max.is_finite(), "both ends of a range are finite numbers");
-                // False for NaN.
-                assert!(min <= default && default <= max, "the default of a parameter is in its range");
-                if let Some(slope) = slope_per_s {
-                    assert!(
-                        slope.is_finite() && slope > 0.0,
-                        "a slope is greater than zero, in units per second"
-                    );
-                }
-            }
-            Domain::Integer { default, min, max } => {
-                assert!(min <= default && default <= max, "the default of a parameter is in its range");
-            }
-            Domain::Flag { .. } => {}
+        if let Some(why) = descriptors[at].fault() {
+            panic!("{}", why);
         }
         at += 1;
     }

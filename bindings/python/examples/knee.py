@@ -1,28 +1,18 @@
-"""A drive that its node starts and restarts: `sinew-node bindings/python/examples/knee.toml`."""
+"""Shows the torque of the knee of the walking exoskeleton ten times a second, and how old each value is."""
 
 import asyncio
-import os
 
 import sinew
 
 
-# ANCHOR: drive
-@sinew.payload("demo.joint_angle", class_="stream", expires_after=0.02)
-class JointAngle:
-    degrees: float
-
-
 async def main() -> None:
-    # The node sets SINEW_SOCKET and SINEW_NAME. Nobody else can register this name.
-    async with sinew.register(os.environ["SINEW_NAME"], handles=[JointAngle]) as me:
-        print("the drive is homed")  # a line of the node's log
-        await me.ready()
+    async with sinew.register("plot", requires=["knee.drive"]) as me:
+        await me.join("exo.ticks")  # each drive sends each of its ticks to this group
         async for message in me:
-            if message.is_kind(JointAngle):
-                print(f"{message.value.degrees} degrees")
-            else:
-                message.settle(sinew.Outcome.REJECTED_UNKNOWN_KIND)
+            if message.value["joint"] == 1 and message.age is not None:
+                torque = message.value["torque_nm"] or 0.0
+                print(f"{torque:6.1f} Nm {'#' * round(25 + torque / 2):50} {message.age * 1e6:5.0f} us")
+                await asyncio.sleep(0.1)  # of a stream only the newest value waits
 
 
 asyncio.run(main())
-# ANCHOR_END: drive

@@ -11,15 +11,17 @@ use sinew_client::{ApiError, AsyncEndpoint, Barrier, EventLoop, LoanedMessage, M
 use sinew_model::barrier::OnPartyLoss;
 use sinew_runtime::{
     outcome::Outcome,
-    parameters::{NamedValue, Value},
+    parameters::NamedValue,
     tid::Tid,
     wire::{Class, Kind},
 };
 
 use crate::{
     errors,
+    fork::Owner,
     guard::{OutputGuard, ProtectedType, check_callback, safe_function},
     operation::{Done, Failure, Operation, Running, gone},
+    parameters::{AnyValue, Registered},
     received::Received,
     seconds,
 };
@@ -34,24 +36,6 @@ type UndeliveredTuple = (u64, Option<String>, Option<u32>, u8, u64);
 pub(crate) enum To {
     Tid(u64),
     Name(String),
-}
-
-/// A value of a parameter. A flag is a number in Python, too, and so comes first.
-#[derive(FromPyObject)]
-enum ParameterValue {
-    Flag(bool),
-    Integer(i64),
-    Number(f64),
-}
-
-impl From<ParameterValue> for Value {
-    fn from(value: ParameterValue) -> Self {
-        match value {
-            ParameterValue::Flag(flag) => Self::Flag(flag),
-            ParameterValue::Integer(integer) => Self::Integer(integer),
-            ParameterValue::Number(number) => Self::Number(number),
-        }
-    }
 }
 
 /// A message to send: destination, kind, class, payload, seconds to wait for room, seconds until it expires.
@@ -158,50 +142,53 @@ impl Facts {
 #[pyclass(frozen, module = "sinew._sinew")]
 pub(crate) struct Core {
     /// `None` once it is unregistered.
-    endpoint: Arc<tokio::sync::Mutex<Option<AsyncEndpoint>>>,
+    endpoint: Arc<tokio::sync::Mutex<Option<Registered>>>,
     events: EventLoop,
     facts: Arc<Mutex<Facts>>,
-    /// The process that registered it: a child of `fork` has only a copy.
-    pid: u32,
+    owner: Owner,
 }
 
 /// The endpoint, for one operation.
 struct Lease {
-    endpoint: tokio::sync::OwnedMutexGuard<Option<AsyncEndpoint>>,
+    endpoint: tokio::sync::OwnedMutexGuard<Option<Registered>>,
     facts: Arc<Mutex<Facts>>,
 }
 
 impl Deref for Lease {
-    type Target = Option<AsyncEndpoint>;
+    type Target = Option<Registered>;
 
-    fn deref(&self) -> &Option<AsyncEndpoint> {
+    fn deref(&self) -> &Option<Registered> {
         &self.endpoint
     }
 }
 
 impl DerefMut for Lease {
-    fn deref_mut(&mut self) -> &mut Option<AsyncEndpoint> {
+    fn deref_mut(&mut self) -> &mut Option<Registered> {
         &mut self.endpoint
     }
 }
 
 impl Drop for Lease {
     fn drop(&mut self) {
-        if let Some(endpoint) = &*self.endpoint {
-            *self.facts.lock().unwrap_or_else(PoisonError::into_inner) = Facts::of(endpoint);
+        if let Some(Registered { endpoint, .. }) = &*self.endpoint {
+            let mut facts = self.facts.lock().unwrap_or_else(PoisonError::into_inner);
+            // All others change with a registration alone.
+            if facts.registrations != endpoint.registrations() {
+                *facts = Facts::of(endpoint);
+            }
         }
     }
 }
 
 impl Core {
-    pub(crate) fn new(endpoint: AsyncEndpoint, events: EventLoop) -> Self {
-        let facts = Arc::new(Mutex::new(Facts::of(&endpoint)));
-        let endpoint = Arc::new(tokio::sync::Mutex::new(Some(endpoint)));
-        Self { endpoint, events, facts, pid: std::process::id() }
+    pub(crate) fn new(registered: Registered, events: EventLoop) -> Self {
+        let facts = Arc::new(Mutex::new(Facts::of(&registered.endpoint)));
+        let endpoint = Arc::new(tokio::sync::Mutex::new(Some(registered)));
+        Self { endpoint, events, facts, owner: Owner::this_process() }
     }
 
     fn lease(&self, py: Python<'_>) -> PyResult<Lease> {
-        if self.pid != std::process::id() {
+        if self.owner.is_parent() {
             let text = "the endpoint belongs to the process that this one was forked from; register another one here";
             return Err(errors::named(py, "ForkedError", text));
         }
@@ -220,10 +207,18 @@ impl Core {
     where
         M: for<'e> FnOnce(&'e mut AsyncEndpoint) -> Running<'e> + Send + 'static,
     {
+        self.begin_with_parameters(py, move |registered| make(&mut registered.endpoint))
+    }
+
+    /// Begins an operation that needs the parameters, too.
+    fn begin_with_parameters<M>(&self, py: Python<'_>, make: M) -> PyResult<Operation>
+    where
+        M: for<'e> FnOnce(&'e mut Registered) -> Running<'e> + Send + 'static,
+    {
         let mut lease = self.lease(py)?;
         let future = async move {
             match &mut *lease {
-                Some(endpoint) => make(endpoint).await,
+                Some(registered) => make(registered).await,
                 None => Err(Failure::Gone),
             }
         };
@@ -232,6 +227,15 @@ impl Core {
 
     fn facts<T>(&self, read: impl FnOnce(&Facts) -> T) -> T {
         read(&self.facts.lock().unwrap_or_else(PoisonError::into_inner))
+    }
+}
+
+impl Drop for Core {
+    fn drop(&mut self) {
+        // The end of a copy would close the connection of the parent.
+        if self.owner.is_parent() {
+            std::mem::forget(Arc::clone(&self.endpoint));
+        }
     }
 }
 
@@ -325,8 +329,29 @@ impl Core {
 
     /// Waits for a message: a `Received`.
     fn receive(&self, py: Python<'_>) -> PyResult<Operation> {
-        self.begin(py, |endpoint| {
-            Box::pin(async move { Ok(Done::Received(Arc::new(endpoint.receive().await?))) })
+        self.begin_with_parameters(py, |registered| {
+            Box::pin(async move { Ok(Done::Received(Arc::new(registered.receive().await?))) })
+        })
+    }
+
+    /// Sends without a confirmation, and blocks until the message has room.
+    fn send_now(&self, py: Python<'_>, message: Outgoing) -> PyResult<()> {
+        self.send(py, message)?.run(py, None).map(drop)
+    }
+
+    /// Blocks until a message arrives, `timeout` seconds at most: a `Received`, or `None`.
+    #[pyo3(signature = (timeout=None))]
+    fn receive_now(&self, py: Python<'_>, timeout: Option<f64>) -> PyResult<Option<Py<PyAny>>> {
+        Ok(self.receive(py)?.run(py, timeout)?.map(|(received,)| received))
+    }
+
+    /// Begins a turn of the loop that reads the parameters.
+    fn tick(&self, py: Python<'_>) -> PyResult<Operation> {
+        self.begin_with_parameters(py, |registered| {
+            Box::pin(async move {
+                registered.tick().await;
+                Ok(Done::Nothing)
+            })
         })
     }
 
@@ -387,12 +412,12 @@ impl Core {
     fn set_together(
         &self,
         py: Python<'_>,
-        sets: Vec<(String, Vec<(String, ParameterValue)>)>,
+        sets: Vec<(String, Vec<(String, AnyValue)>)>,
         lead: f64,
         within: f64,
     ) -> PyResult<Operation> {
         let (lead, within) = (seconds("lead", lead)?, seconds("within", within)?);
-        let named = |(name, value): (String, ParameterValue)| NamedValue { name, value: value.into() };
+        let named = |(name, value): (String, AnyValue)| NamedValue { name, value: value.into() };
         let sets = sets.into_iter().map(|(app, values)| (app, values.into_iter().map(named).collect()));
         let sets = sets.collect();
         self.begin(py, move |endpoint| {
@@ -433,7 +458,7 @@ impl Core {
         let mut lease = self.lease(py)?;
         let output = ((), safe_function(safe));
         let made = py.detach(move || {
-            lease.as_mut().map(|endpoint| endpoint.hold(Tid::from_bits(source), protected, output))
+            lease.as_mut().map(|of| of.endpoint.hold(Tid::from_bits(source), protected, output))
         });
         match made {
             Some(made) => made.map(OutputGuard::new).map_err(|error| errors::guard(py, &error)),
@@ -444,7 +469,7 @@ impl Core {
     /// Returns the next report of messages that were not delivered. Never waits.
     fn take_undelivered(&self, py: Python<'_>) -> PyResult<Option<UndeliveredTuple>> {
         let mut lease = self.lease(py)?;
-        let report = lease.as_mut().and_then(AsyncEndpoint::take_undelivered);
+        let report = lease.as_mut().and_then(|of| of.endpoint.take_undelivered());
         Ok(report.map(|report| {
             let code = Outcome::Rejected(report.why).code();
             (report.destination.bits(), report.name, report.kind.map(Kind::bits), code, report.count)
@@ -456,7 +481,7 @@ impl Core {
         let mut lease = self.lease(py)?;
         let future = async move {
             match lease.take() {
-                Some(endpoint) => endpoint.unregister().await.map(|()| Done::Nothing).map_err(Failure::Api),
+                Some(of) => of.endpoint.unregister().await.map(|()| Done::Nothing).map_err(Failure::Api),
                 None => Err(Failure::Gone),
             }
         };

@@ -16,7 +16,7 @@ use sinew_runtime::{
     wire::{Class, Kind},
 };
 
-use crate::{endpoint::class_of, errors, seconds};
+use crate::{endpoint::class_of, errors, fork::Owner, seconds};
 
 /// Maximum number of names of protected types in a process: each is kept until it ends.
 const NAMES_MAX: usize = 1_024;
@@ -117,11 +117,15 @@ pub(crate) fn safe_function(
 /// The guard of an output. Each call releases the GIL before it waits for the output: the thread that makes outputs
 /// safe holds the output while it waits for the GIL.
 #[pyclass(frozen, module = "sinew._sinew")]
-pub(crate) struct OutputGuard(Option<Guard<()>>);
+pub(crate) struct OutputGuard {
+    /// `None` while it is dropped.
+    guard: Option<Guard<()>>,
+    owner: Owner,
+}
 
 impl OutputGuard {
-    pub(crate) const fn new(guard: Guard<()>) -> Self {
-        Self(Some(guard))
+    pub(crate) fn new(guard: Guard<()>) -> Self {
+        Self { guard: Some(guard), owner: Owner::this_process() }
     }
 
     /// Calls a function with the guard, without the GIL.
@@ -136,7 +140,7 @@ impl OutputGuard {
         py: Python<'_>,
         call: impl FnOnce(&Guard<()>) -> R + Send,
     ) -> PyResult<R> {
-        let guard = &self.0;
+        let guard = &self.guard;
         py.detach(|| guard.as_ref().map(call))
             .ok_or_else(|| errors::named(py, "GuardError", "this guard has ended; create another one"))
     }
@@ -144,7 +148,12 @@ impl OutputGuard {
 
 impl Drop for OutputGuard {
     fn drop(&mut self) {
-        let Some(guard) = self.0.take() else { return };
+        let Some(guard) = self.guard.take() else { return };
+        if self.owner.is_parent() {
+            // The parent has the output, and the thread that makes it safe.
+            std::mem::forget(guard);
+            return;
+        }
         if IS_IN_CALLBACK.get() {
             // Its end would wait for the output that this thread uses. The output is safe permanently without it.
             guard.release_later();

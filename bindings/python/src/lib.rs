@@ -8,8 +8,10 @@
 //! | `endpoint.rs` | an endpoint: each call begins one operation |
 //! | `registration.rs` | the registration of an endpoint |
 //! | `operation.rs` | an operation: a future that Python polls |
+//! | `parameters.rs` | parameters that the program serves |
 //! | `received.rs` | received messages, and their memory for numpy |
 //! | `guard.rs` | guards of outputs for protected payloads |
+//! | `fork.rs` | copies in the child of a fork |
 //! | `codec.rs` | MessagePack to and from values of Python |
 //! | `schema.rs` | structures of payload types |
 //! | `bag.rs` | files of recordings |
@@ -19,8 +21,10 @@ mod bag;
 mod codec;
 mod endpoint;
 mod errors;
+mod fork;
 mod guard;
 mod operation;
+mod parameters;
 mod received;
 mod registration;
 mod schema;
@@ -87,14 +91,16 @@ mod _sinew {
         bag::BagReader,
         codec::{decode, encode},
         endpoint::Core,
+        fork::forked,
         group_tid,
         guard::OutputGuard,
         kind_of, now,
         operation::Operation,
         outcome_text,
+        parameters::{ParameterDeclarations, ParameterSet},
         received::{Memory, Received},
         registration::register,
-        schema::parse_schema,
+        schema::{make_schema, parse_schema},
         tid_of, tid_text,
     };
 }

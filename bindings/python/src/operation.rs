@@ -3,17 +3,16 @@
 use std::{
     os::fd::{AsFd as _, AsRawFd as _},
     pin::Pin,
-    sync::{Arc, Mutex, PoisonError},
+    sync::{
+        Arc, Mutex, PoisonError,
+        atomic::{AtomicBool, Ordering},
+    },
     task::Poll,
     time::Duration,
 };
 
 use pyo3::{IntoPyObjectExt as _, prelude::*};
-use rustix::{
-    event::{PollFd, PollFlags, Timespec, poll},
-    io::Errno,
-};
-use sinew_client::{ApiError, AsyncEndpoint, BarrierError, EventLoop, SetTogetherError};
+use sinew_client::{ApiError, BarrierError, EventLoop, SetTogetherError};
 use sinew_runtime::{
     outcome::{MemberOutcome, Outcome},
     parameters::{PartOutcome, TransactionReport},
@@ -21,7 +20,10 @@ use sinew_runtime::{
     time::Time,
 };
 
-use crate::{endpoint::Core, errors, guard::check_callback, received::Received, seconds};
+use crate::{
+    endpoint::Core, errors, fork::Owner, guard::check_callback, parameters::Registered, received::Received,
+    seconds,
+};
 
 /// Longest sleep of a blocking call: a signal may interrupt another thread than the one that executes its handler.
 const SIGNAL_CHECK: Duration = Duration::from_millis(250);
@@ -35,7 +37,7 @@ pub(crate) enum Done {
     Resolved(Option<Tid>),
     Generation(u64),
     Together(TransactionReport),
-    Registered(Box<AsyncEndpoint>),
+    Registered(Box<Registered>),
 }
 
 /// Why an operation has failed.
@@ -61,20 +63,38 @@ pub(crate) type Running<'e> = Pin<Box<dyn Future<Output = Ended> + Send + 'e>>;
 pub(crate) struct Operation {
     future: Mutex<Option<Running<'static>>>,
     events: EventLoop,
+    /// Whether events are to be taken before the next poll: not before the first one, and not after a blocking wait.
+    has_events: AtomicBool,
+    owner: Owner,
 }
 
 impl Operation {
     pub(crate) fn new(future: Running<'static>, events: EventLoop) -> Self {
-        Self { future: Mutex::new(Some(future)), events }
+        Self {
+            future: Mutex::new(Some(future)),
+            events,
+            has_events: AtomicBool::new(false),
+            owner: Owner::this_process(),
+        }
     }
 
     /// Polls the future, without the GIL: a safe function of Python may have to run meanwhile.
     fn step(&self, py: Python<'_>) -> PyResult<Option<Py<PyAny>>> {
         // A received message may be for the guard of the output that this thread uses.
         check_callback(py)?;
+        if self.owner.is_parent() {
+            let text =
+                "this operation belongs to the process that this one was forked from; begin another one here";
+            return Err(errors::named(py, "ForkedError", text));
+        }
         let polled = py.detach(|| {
             let mut future = self.future.lock().unwrap_or_else(PoisonError::into_inner);
-            let polled = self.events.poll(future.as_mut()?.as_mut());
+            let running = future.as_mut()?.as_mut();
+            // SYNC: Relaxed; the lock of the future orders it.
+            let polled = match self.has_events.swap(true, Ordering::Relaxed) {
+                true => self.events.poll(running),
+                false => self.events.poll_first(running),
+            };
             if polled.is_ready() {
                 *future = None;
             }
@@ -107,7 +127,7 @@ impl Operation {
                 let parts = report.parts.into_iter().map(|part| (part.app, in_words(part.outcome)));
                 (format!("{:?}", report.verdict), parts.collect::<Vec<_>>()).into_py_any(py)
             }
-            Done::Registered(endpoint) => Core::new(*endpoint, self.events.clone()).into_py_any(py),
+            Done::Registered(registered) => Core::new(*registered, self.events.clone()).into_py_any(py),
         }
     }
 
@@ -131,6 +151,15 @@ fn in_words(outcome: PartOutcome) -> (&'static str, u64, String) {
 /// Returns the exception for an endpoint that was unregistered.
 pub(crate) fn gone(py: Python<'_>) -> PyErr {
     errors::named(py, "ClosedError", "this endpoint is unregistered; register a new one")
+}
+
+impl Drop for Operation {
+    fn drop(&mut self) {
+        // The end of a copy would withdraw the request of the parent.
+        if self.owner.is_parent() {
+            std::mem::forget(self.future.get_mut().unwrap_or_else(PoisonError::into_inner).take());
+        }
+    }
 }
 
 #[pymethods]
@@ -158,7 +187,7 @@ impl Operation {
     /// Continues the operation to its end, and blocks meanwhile without the GIL. Returns `None` if it has not ended
     /// within `timeout` seconds; then it is cancelled. Signal handlers of Python run.
     #[pyo3(signature = (timeout=None))]
-    fn run(&self, py: Python<'_>, timeout: Option<f64>) -> PyResult<Option<(Py<PyAny>,)>> {
+    pub(crate) fn run(&self, py: Python<'_>, timeout: Option<f64>) -> PyResult<Option<(Py<PyAny>,)>> {
         let within = timeout.map(|timeout| seconds("within", timeout)).transpose()?;
         let deadline = within.map_or(Time::MAX, |within| Time::now() + within);
         loop {
@@ -171,21 +200,12 @@ impl Operation {
                 return Ok(None);
             }
             let left = self.events.wake_in().unwrap_or(Duration::MAX).min(deadline.since(now));
-            let waited = py.detach(|| wait_readable(&self.events, left.min(SIGNAL_CHECK)));
-            waited?;
+            py.detach(|| self.events.take_events(left.min(SIGNAL_CHECK)))?;
+            self.has_events.store(false, Ordering::Relaxed);
             if let Err(interrupted) = py.check_signals() {
                 self.drop_future(py);
                 return Err(interrupted);
             }
         }
-    }
-}
-
-/// Blocks until the descriptor is readable, for this time at most.
-fn wait_readable(events: &EventLoop, left: Duration) -> std::io::Result<()> {
-    let left = Timespec { tv_sec: 0, tv_nsec: left.min(SIGNAL_CHECK).subsec_nanos().into() };
-    match poll(&mut [PollFd::new(events, PollFlags::IN)], Some(&left)) {
-        Ok(_) | Err(Errno::INTR) => Ok(()),
-        Err(why) => Err(why.into()),
     }
 }

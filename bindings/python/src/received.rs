@@ -10,7 +10,7 @@ use pyo3::{
 };
 use sinew_runtime::{outcome::Outcome, time::Time, wire::Class};
 
-use crate::seconds;
+use crate::{errors, fork::Owner, seconds};
 
 /// A received message. It settles as delivered when it is dropped.
 #[pyclass(frozen, module = "sinew._sinew")]
@@ -19,6 +19,7 @@ pub(crate) struct Received {
     message: Mutex<Option<Arc<sinew_client::Received>>>,
     payload: Bytes,
     facts: Facts,
+    owner: Owner,
 }
 
 /// The header of a message, also after its settlement.
@@ -48,12 +49,21 @@ impl Received {
             is_retained: message.is_retained(),
         };
         let payload = message.payload();
-        Self { message: Mutex::new(Some(message)), payload, facts }
+        Self { message: Mutex::new(Some(message)), payload, facts, owner: Owner::this_process() }
     }
 
     /// Returns the message for a reply; `None` after its settlement.
     pub(crate) fn request(&self) -> Option<Arc<sinew_client::Received>> {
         self.message.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+}
+
+impl Drop for Received {
+    fn drop(&mut self) {
+        // The parent settles it.
+        if self.owner.is_parent() {
+            std::mem::forget(self.request());
+        }
     }
 }
 
@@ -142,6 +152,10 @@ impl Received {
     fn settle(&self, py: Python<'_>, code: u8) -> PyResult<()> {
         let outcome = Outcome::from_code(code)
             .ok_or_else(|| PyValueError::new_err(format!("no outcome has the code {code}")))?;
+        if self.owner.is_parent() {
+            let text = "the message belongs to the process that this one was forked from, which settles it";
+            return Err(errors::named(py, "ForkedError", text));
+        }
         py.detach(|| {
             let message = self.message.lock().unwrap_or_else(PoisonError::into_inner).take();
             // A reply that is under way settles it.

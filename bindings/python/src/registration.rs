@@ -3,13 +3,15 @@
 use std::{path::PathBuf, time::Duration};
 
 use pyo3::{exceptions::PyValueError, prelude::*};
-use sinew_client::{EventLoop, NodeApi, Registration, Transport};
+use sinew_client::{DirectLinks, EventLoop, NodeApi, Registration, Transport};
 use sinew_model::facts::NodeEvent;
 use sinew_runtime::{app::RequirementEvent, tid::AppAddress};
+use sinew_schema::Schema;
 
 use crate::{
     errors,
     operation::{Done, Operation},
+    parameters::{ParameterSet, Registered, ToServe},
     seconds,
 };
 
@@ -24,7 +26,9 @@ const INBOX_MAX: usize = 65_536;
 pub(crate) struct Options {
     name: Option<String>,
     requires: Vec<String>,
-    handles: Vec<String>,
+    handles: Vec<NamedType>,
+    sends: Vec<NamedType>,
+    parameters: Option<(Py<ParameterSet>, f64)>,
     node_events: bool,
     requirement_events: bool,
     deadline: f64,
@@ -34,7 +38,11 @@ pub(crate) struct Options {
     socket_only: bool,
     reconnect: bool,
     own_user_only: bool,
+    direct: String,
 }
+
+/// The name of a type, and the canonical bytes of its structure if that is known.
+type NamedType = (String, Option<Vec<u8>>);
 
 impl Options {
     fn registration(self) -> PyResult<Registration> {
@@ -53,8 +61,20 @@ impl Options {
         if let Some(address) = self.address {
             registration = registration.fixed_address(AppAddress::new(address));
         }
-        for kind in self.handles {
-            registration = registration.handles_named(kind);
+        for (name, structure) in self.handles {
+            registration = match structure {
+                Some(bytes) => registration.handles_structure(&name, &parsed(&name, &bytes)?),
+                None => registration.handles_named(name),
+            };
+        }
+        for (name, structure) in self.sends {
+            registration = match structure {
+                Some(bytes) => registration.sends_structure(&name, &parsed(&name, &bytes)?),
+                None => registration.handles_named(name),
+            };
+        }
+        if self.parameters.is_some() {
+            registration = registration.serves_parameters();
         }
         if self.node_events {
             registration = registration.subscribe::<NodeEvent>();
@@ -62,6 +82,15 @@ impl Options {
         if self.requirement_events {
             registration = registration.subscribe::<RequirementEvent>();
         }
+        registration = registration.direct(match self.direct.as_str() {
+            "automatic" => DirectLinks::Automatic,
+            "always" => DirectLinks::Always,
+            "never" => DirectLinks::Never,
+            other => {
+                let text = format!("direct is {other:?}: take \"automatic\", \"always\" or \"never\"");
+                return Err(PyValueError::new_err(text));
+            }
+        });
         if self.socket_only {
             registration = registration.transport(Transport::Socket);
         }
@@ -69,10 +98,18 @@ impl Options {
     }
 }
 
+fn parsed(name: &str, bytes: &[u8]) -> PyResult<Schema> {
+    Schema::parse(bytes).map_err(|why| PyValueError::new_err(format!("the structure of {name}: {why}")))
+}
+
 /// Begins a registration at the node with this socket. The result is a `Core`.
 #[pyfunction]
 pub(crate) fn register(py: Python<'_>, socket: PathBuf, options: Options) -> PyResult<Operation> {
     let own_user_only = options.own_user_only;
+    let parameters = match &options.parameters {
+        Some((set, period)) => Some(ToServe::new(set.get(), seconds("period", *period)?)),
+        None => None,
+    };
     let registration = options.registration()?;
     let events = EventLoop::new()?;
     let connected = py.detach(|| {
@@ -86,7 +123,7 @@ pub(crate) fn register(py: Python<'_>, socket: PathBuf, options: Options) -> PyR
     let of_endpoint = events.clone();
     let future = async move {
         let endpoint = node.register_transport_address_on(registration, of_endpoint).await?;
-        Ok(Done::Registered(Box::new(endpoint)))
+        Ok(Done::Registered(Box::new(Registered::new(endpoint, parameters.as_ref()))))
     };
     Ok(Operation::new(Box::pin(future), events))
 }

@@ -97,6 +97,22 @@ class Node:
         return sinew.register(name, socket=self.socket, **options)
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--long", action="store_true", help="also the tests that take minutes")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    config.addinivalue_line("markers", "long: takes minutes, and runs with --long alone")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: List[pytest.Item]) -> None:
+    if config.getoption("--long"):
+        return
+    for item in items:
+        if item.get_closest_marker("long"):
+            item.add_marker(pytest.mark.skip(reason="it takes minutes: --long"))
+
+
 @pytest.fixture
 def start_node() -> Iterator[Callable[..., Node]]:
     """Starts nodes of one project, and ends them after the test."""
@@ -129,10 +145,11 @@ def peer(start_node: Callable[..., Node]) -> Node:
 
 
 @pytest.fixture(autouse=True)
-def watchdog() -> Iterator[None]:
+def watchdog(request: pytest.FixtureRequest) -> Iterator[None]:
     """Ends a test that hangs, with its stack."""
     import faulthandler
 
-    faulthandler.dump_traceback_later(4 * WATCHDOG, exit=True)
+    is_long = request.node.get_closest_marker("long") is not None
+    faulthandler.dump_traceback_later((40 if is_long else 4) * WATCHDOG, exit=True)
     yield
     faulthandler.cancel_dump_traceback_later()

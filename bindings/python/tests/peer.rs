@@ -1,4 +1,4 @@
-//! A node with an application in Rust, for the tests of the Python package: `peer CONFIGURATION`.
+//! A node with applications in Rust, for the tests of the Python package: `peer CONFIGURATION`.
 
 use std::{process::ExitCode, sync::Arc};
 
@@ -18,6 +18,17 @@ payload!("peer.report" => struct Report {
     note: Option<String>,
     class: u16,
 });
+
+payload!("peer.get_lateness" => struct GetLateness {});
+payload!("peer.lateness" =>
+    /// How late each tick of the loop was since the last request, in microseconds; at most `TICKS_MAX`.
+    struct Lateness { late_us: Vec<u32> }
+);
+
+/// Group of the receivers of the loop's ticks.
+const TICKS: &str = "peer.ticks";
+/// Maximum number of ticks in one report: 20 s.
+const TICKS_MAX: usize = 20_000;
 
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(crate = "sinew::serde")]
@@ -105,6 +116,35 @@ impl Handler<Delivery<GetReport>> for Knee {
     }
 }
 
+/// A loop of 1 kHz, which begins at the first request for its lateness, and sends each tick to a group.
+struct Loop {
+    late_us: Option<Vec<u32>>,
+}
+
+impl Actor for Loop {
+    type Context = AppContext<Self>;
+}
+
+impl Handler<Delivery<GetLateness>> for Loop {
+    type Result = ();
+
+    fn handle(&mut self, request: Delivery<GetLateness>, ctx: &mut Self::Context) {
+        if self.late_us.is_none() {
+            ctx.every(Duration::from_millis(1), |this, tick, ctx| {
+                if let Some(late_us) = this.late_us.as_mut().filter(|late_us| late_us.len() < TICKS_MAX) {
+                    late_us.push(u32::try_from(tick.lateness.as_micros()).unwrap_or(u32::MAX));
+                }
+                // Without a member there is no receiver.
+                let _ = ctx.send(Tid::group(TICKS), &Angle { degrees: tick.number as f32 });
+            });
+        }
+        let late_us = self.late_us.replace(Vec::new()).unwrap_or_default();
+        if let Err(error) = ctx.reply(&request, &Lateness { late_us }) {
+            eprintln!("no reply: {error}");
+        }
+    }
+}
+
 fn main() -> ExitCode {
     let Some(file) = std::env::args().nth(1) else {
         eprintln!("name the configuration of the node");
@@ -113,5 +153,7 @@ fn main() -> ExitCode {
     let gains: Arc<Gains> = Gains::new();
     let knee = AppSpec::new("knee", || Knee { degrees: 0.0, gait: Gait::Standing, last: Step::None });
     let knee = knee.handles::<Angle>().handles::<Move>().handles::<GetReport>().sends::<Report>();
-    Node::from_file(file).app(knee.params(&gains)).run()
+    let ticks = AppSpec::new("loop", || Loop { late_us: None });
+    let ticks = ticks.handles::<GetLateness>().sends::<Lateness>().sends::<Angle>();
+    Node::from_file(file).app(knee.params(&gains)).app(ticks).run()
 }

@@ -13,7 +13,7 @@ use sinew_runtime::{time::Time, wire::Message};
 
 use super::{EventLoop, is_ready};
 use crate::{
-    ApiError, AsyncEndpoint, NodeApi, Registration, Transport,
+    ApiError, AsyncEndpoint, DirectLinks, NodeApi, Registration, Transport,
     tests::{TORQUE, Torque},
 };
 
@@ -93,6 +93,39 @@ fn descriptor_is_readable_only_after_an_event() {
             assert_eq!(received.decode::<Torque>().unwrap(), TORQUE);
         }
     }
+}
+
+#[test]
+fn message_on_direct_link_makes_descriptor_readable() {
+    // Given: two endpoints with a link
+    let node = TestNode::start();
+    let linked = || {
+        let (api, events) = (NodeApi::connect(node.path()).unwrap(), EventLoop::new().unwrap());
+        let registration = Registration::new().direct(DirectLinks::Always).deadline(WATCHDOG);
+        let endpoint = run(&events, api.register_transport_address_on(registration, events.clone())).unwrap();
+        (endpoint, events)
+    };
+    let ((mut one, events), (mut other, others)) = (linked(), linked());
+    let (tid, deadline) = (one.tid(), Time::now() + WATCHDOG);
+    while one.endpoint.direct.open.is_empty() || other.endpoint.direct.open.is_empty() {
+        assert!(Time::now() < deadline, "they have no link");
+        run(&others, other.send(tid, &TORQUE)).unwrap();
+        drop(run(&events, one.receive()).unwrap());
+    }
+    for _ in 0..300 {
+        let mut receiving = pin!(one.receive());
+        assert!(poll_until_silent(&events, receiving.as_mut()).is_none());
+        // When
+        run(&others, other.send(tid, &TORQUE)).unwrap();
+        // Then
+        await_readable(&events);
+        assert_eq!(run(&events, receiving).unwrap().source(), other.tid());
+    }
+    // Its end is an event, too, and messages go through the node from then on.
+    drop(other);
+    let (mut other, others) = linked();
+    run(&others, other.send(tid, &TORQUE)).unwrap();
+    assert_eq!(run(&events, one.receive()).unwrap().source(), other.tid());
 }
 
 #[test]

@@ -36,7 +36,7 @@ use loan::InRing;
 pub(super) use ring::Arrived;
 use ring::{Begun, Rest};
 pub(super) use server_trust::{ServerTrust, UntrustedServerError};
-pub(super) use types::{Use, UsedTypes};
+pub(super) use types::{TypeOf, Use, UsedTypes};
 
 /// Maximum wait for a place in the accept queue of a node, if the caller has that long.
 pub(super) const CONNECT: Duration = Duration::from_secs(2);

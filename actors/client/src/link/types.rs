@@ -17,7 +17,7 @@ use sinew_runtime::{
     log,
     tid::Tid,
     time::Time,
-    wire::{Kind, Message, PayloadType},
+    wire::{Kind, Message, MismatchPolicy, PayloadType},
 };
 
 use super::{Progress, Writer};
@@ -29,6 +29,9 @@ const TYPES_MAX: usize = 128;
 const WITHIN: Duration = Duration::from_secs(10);
 /// Time between two tries of one declaration.
 const PAUSE: Duration = Duration::from_millis(5);
+/// Policy of a handled type without a Rust definition. Languages without exact numbers read more than they declare, so
+/// their decoder decides.
+const GIVEN_POLICY: MismatchPolicy = MismatchPolicy::Warn;
 /// Prefix of the names of Sinew's own types, which layers keep compatible.
 const OWN_PREFIX: &str = "sinew.";
 
@@ -43,16 +46,42 @@ pub(crate) enum Use {
 #[derive(Clone, Debug, Default)]
 pub(crate) struct UsedTypes(Vec<UsedType>);
 
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Debug)]
 struct UsedType {
-    of: PayloadType,
+    of: TypeOf,
     is_handled: bool,
     is_sent: bool,
 }
 
+/// A type, and the origin of its structure.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) enum TypeOf {
+    /// A type of Rust. Its structure is found when it is needed first.
+    Rust(PayloadType),
+    /// A type without a Rust definition, with the canonical bytes of its structure.
+    Given { name: String, schema: Vec<u8> },
+}
+
+impl TypeOf {
+    fn name(&self) -> &str {
+        match self {
+            Self::Rust(of) => of.name(),
+            Self::Given { name, .. } => name,
+        }
+    }
+
+    /// Returns whether the structure is known without a search.
+    fn is_known(&self) -> bool {
+        match self {
+            Self::Rust(of) => of.is_traced(),
+            Self::Given { .. } => true,
+        }
+    }
+}
+
 impl UsedTypes {
     /// Adds a use of a type. One beyond the maximum is not declared, and so not compared.
-    pub(crate) fn add(&mut self, of: PayloadType, as_what: Use) {
+    pub(crate) fn add(&mut self, of: TypeOf, as_what: Use) {
         if of.name().starts_with(OWN_PREFIX) {
             return;
         }
@@ -60,7 +89,7 @@ impl UsedTypes {
             if self.0.len() == TYPES_MAX {
                 return;
             }
-            self.0.push(UsedType { of, is_handled: false, is_sent: false });
+            self.0.push(UsedType { of: of.clone(), is_handled: false, is_sent: false });
         }
         for one in self.0.iter_mut().filter(|one| one.of == of) {
             one.is_handled |= as_what == Use::Handled;
@@ -71,9 +100,9 @@ impl UsedTypes {
     /// Declares the types to the node of a new connection. Never waits.
     pub(super) fn declare(&self, own: Tid, payload_max: usize, writer: &Arc<Writer>) {
         let is_declared = |one: &&UsedType| {
-            one.of.is_traced() && declaration(one, own, payload_max).is_none_or(|frame| write(writer, &frame))
+            one.of.is_known() && declaration(one, own, payload_max).is_none_or(|frame| write(writer, &frame))
         };
-        let rest: Vec<UsedType> = self.0.iter().filter(|one| !is_declared(one)).copied().collect();
+        let rest: Vec<UsedType> = self.0.iter().filter(|one| !is_declared(one)).cloned().collect();
         if rest.is_empty() {
             return;
         }
@@ -87,14 +116,10 @@ impl UsedTypes {
 }
 
 /// Finds the structures of these types on a thread of low priority. Returns their declarations.
-fn declarations(
-    types: &[UsedType],
-    own: Tid,
-    payload_max: usize,
-) -> std::io::Result<Vec<(PayloadType, Message)>> {
+fn declarations(types: &[UsedType], own: Tid, payload_max: usize) -> std::io::Result<Vec<(TypeOf, Message)>> {
     let find = move || {
         lower_priority();
-        let all = types.iter().filter_map(|one| Some((one.of, declaration(one, own, payload_max)?)));
+        let all = types.iter().filter_map(|one| Some((one.of.clone(), declaration(one, own, payload_max)?)));
         all.collect()
     };
     thread::scope(|scope| {
@@ -130,14 +155,19 @@ fn declare_later(types: &[UsedType], own: Tid, payload_max: usize, writer: &Weak
 
 /// Returns the frame that declares a type. `None`: its structure is not known, or too long for the node.
 fn declaration(one: &UsedType, own: Tid, payload_max: usize) -> Option<Message> {
-    let UsedType { of, is_handled, is_sent } = *one;
+    let (kind, policy, protected, schema) = match &one.of {
+        TypeOf::Rust(of) => {
+            (of.kind(), of.mismatch(), of.is_protected(), of.schema().ok()?.schema().encode())
+        }
+        TypeOf::Given { name, schema } => (Kind::named(name), GIVEN_POLICY, false, schema.clone()),
+    };
     let declaration = TypeDeclaration {
-        kind: of.kind(),
-        handles: is_handled,
-        sends: is_sent,
-        policy: of.mismatch().word().to_owned(),
-        protected: of.is_protected(),
-        schema: of.schema().ok()?.schema().encode(),
+        kind,
+        handles: one.is_handled,
+        sends: one.is_sent,
+        policy: policy.word().to_owned(),
+        protected,
+        schema,
     };
     let frame = payload::frame(Kind::LNCL_TYPE, own, payload::lncl_of(own.node), &declaration);
     (frame.payload.len() <= payload_max).then_some(frame)
@@ -182,7 +212,7 @@ mod tests {
     use serde::{Deserialize, Serialize};
     use sinew_runtime::{
         tid::{AppAddress, NodeAddress},
-        wire::{MismatchPolicy, Payload},
+        wire::Payload,
     };
 
     use super::*;
@@ -219,9 +249,9 @@ mod tests {
     fn type_is_declared_once_with_its_uses_and_policy() {
         let mut types = UsedTypes::default();
         let [angle, own] = [PayloadType::of::<Angle>(), PayloadType::of::<Own>()].map(|one| one.unwrap());
-        types.add(angle, Use::Handled);
-        types.add(own, Use::Handled);
-        types.add(angle, Use::Sent);
+        types.add(TypeOf::Rust(angle), Use::Handled);
+        types.add(TypeOf::Rust(own), Use::Handled);
+        types.add(TypeOf::Rust(angle), Use::Sent);
         let [one] = &types.0[..] else { panic!("{types:?}") };
         let frame = declaration(one, TID, 4_096).expect("it has a structure");
         let read: TypeDeclaration = payload::read(&frame.payload).unwrap();
@@ -241,13 +271,36 @@ mod tests {
     }
 
     #[test]
+    fn given_structure_is_declared_as_it_is() {
+        let mut types = UsedTypes::default();
+        let schema = PayloadType::of::<Angle>().unwrap().schema().unwrap().schema().encode();
+        let given = TypeOf::Given { name: "test.client_types.given".to_owned(), schema: schema.clone() };
+        types.add(given.clone(), Use::Sent);
+        types.add(given, Use::Handled);
+        let [one] = &types.0[..] else { panic!("{types:?}") };
+        assert!(one.of.is_known());
+        let frame = declaration(one, TID, 4_096).expect("it has a structure");
+        let read: TypeDeclaration = payload::read(&frame.payload).unwrap();
+        let kind = Kind::named("test.client_types.given");
+        let expected = TypeDeclaration {
+            kind,
+            handles: true,
+            sends: true,
+            policy: "warn".to_owned(),
+            protected: false,
+            schema,
+        };
+        assert_eq!(read, expected);
+    }
+
+    #[test]
     fn structures_are_found_before_any_frame_is_written() {
         let mut types = UsedTypes::default();
         let speed = PayloadType::of::<Speed>().expect("the table has room");
-        types.add(speed, Use::Sent);
+        types.add(TypeOf::Rust(speed), Use::Sent);
         assert!(!speed.is_traced());
         let found = declarations(&types.0, TID, 4_096).expect("the system has a thread");
-        assert_eq!(found.iter().map(|(of, _)| *of).collect::<Vec<_>>(), [speed]);
+        assert_eq!(found.into_iter().map(|(of, _)| of).collect::<Vec<_>>(), [TypeOf::Rust(speed)]);
         assert!(speed.is_traced() && declarations(&types.0, TID, 1).is_ok_and(|found| found.is_empty()));
     }
 }

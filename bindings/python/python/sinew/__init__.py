@@ -20,11 +20,14 @@ A Python process is an application apart: a pause of the GIL stalls this applica
 
 from __future__ import annotations
 
-from . import errors
+import os as _os
+
+from . import _sinew, errors
 from ._aio import AsyncEndpoint
 from ._bag import Bag, BagMessage, bag
 from ._blocking import Endpoint
 from ._message import Message
+from ._parameters import parameter, parameters
 from ._protection import Guard, Protected
 from ._register import Registration, register
 from ._reports import (
@@ -38,6 +41,7 @@ from ._reports import (
     TransactionReport,
     Undelivered,
 )
+from ._structure import F32, I8, I16, I32, U8, U16, U32, U64
 from ._types import payload
 from ._values import BROADCAST, MemberOutcome, MessageClass, Outcome, Tid, group
 from .errors import (
@@ -71,8 +75,19 @@ from .errors import (
 
 __version__ = "0.1.0"
 
+# The child has only copies of endpoints and messages.
+_os.register_at_fork(after_in_child=_sinew.forked)
+
 __all__ = [
     "BROADCAST",
+    "F32",
+    "I8",
+    "I16",
+    "I32",
+    "U8",
+    "U16",
+    "U32",
+    "U64",
     "Applied",
     "AsyncEndpoint",
     "BadNameError",
@@ -123,6 +138,8 @@ __all__ = [
     "bag",
     "errors",
     "group",
+    "parameter",
+    "parameters",
     "payload",
     "register",
 ]

@@ -42,26 +42,86 @@ if TYPE_CHECKING:
 __all__ = ["AsyncEndpoint"]
 
 
+class _Reader:
+    """Watches the descriptor and the deadlines of an endpoint for the operation that waits.
+
+    Waits that follow each other at once have one reader in the event loop, and one timer. Both are gone in the next turn
+    of the event loop without a wait.
+    """
+
+    def __init__(self) -> None:
+        self._loop: Optional[asyncio.AbstractEventLoop] = None
+        """The event loop that has the reader now."""
+        self._operation: Optional[_sinew.Operation] = None
+        """Keeps the descriptor open as long as the reader is there. All operations of an endpoint have the same one."""
+        self._step: Optional[Callable[[], None]] = None
+        self._timer: Optional[asyncio.TimerHandle] = None
+
+    def begin(self, operation: _sinew.Operation, step: Callable[[], None]) -> None:
+        """Calls `step` after each event, and at the operation's deadline."""
+        loop = asyncio.get_running_loop()
+        if self._loop is not loop:
+            loop.add_reader(operation.fileno(), self._on_event)
+            self._loop, self._timer = loop, None
+        self._operation, self._step = operation, step
+        self.set_timer()
+
+    def set_timer(self) -> None:
+        """Follows the deadline of the operation. A timer that ends earlier stays: it causes one needless poll."""
+        if self._loop is None or self._operation is None:
+            return
+        left = self._operation.wake_in()
+        if left is None:
+            return
+        at = self._loop.time() + left
+        if self._timer is not None:
+            if self._timer.when() <= at:
+                return
+            self._timer.cancel()
+        self._timer = self._loop.call_at(at, self._on_timer)
+
+    def end(self) -> None:
+        """Ends the wait."""
+        self._step = None
+        if self._loop is not None and not self._loop.is_closed():
+            self._loop.call_soon(self.remove_if_idle)
+
+    def _on_event(self) -> None:
+        if self._step is not None:
+            self._step()
+
+    def _on_timer(self) -> None:
+        self._timer = None
+        self._on_event()
+
+    def remove_if_idle(self) -> None:
+        """Removes the reader, unless an operation waits."""
+        if self._step is not None or self._loop is None or self._operation is None:
+            return
+        if not self._loop.is_closed():
+            self._loop.remove_reader(self._operation.fileno())
+        if self._timer is not None:
+            self._timer.cancel()
+        self._loop = self._operation = self._timer = None
+
+
 class _Waiter:
     """One operation that waits for its descriptor or its deadline, in the running event loop."""
 
-    def __init__(self, operation: _sinew.Operation) -> None:
+    def __init__(self, operation: _sinew.Operation, reader: _Reader) -> None:
         self._loop = asyncio.get_running_loop()
         self._operation = operation
-        self._timer: Optional[asyncio.TimerHandle] = None
+        self._reader = reader
         self.ended: asyncio.Future[_Done] = self._loop.create_future()
 
     async def wait(self, deadline: Optional[float] = None) -> _Done:
         """Returns the result in a tuple; `None` at the deadline, or after `stop`."""
         limit = None if deadline is None else self._loop.call_at(deadline, self.stop)
-        self._loop.add_reader(self._operation.fileno(), self._step)
-        self._set_timer()
+        self._reader.begin(self._operation, self._step)
         try:
             return await self.ended
         finally:
-            self._loop.remove_reader(self._operation.fileno())
-            if self._timer is not None:
-                self._timer.cancel()
+            self._reader.end()
             if limit is not None:
                 limit.cancel()
 
@@ -69,12 +129,6 @@ class _Waiter:
         """Ends the wait without a result."""
         if not self.ended.done():
             self.ended.set_result(None)
-
-    def _set_timer(self) -> None:
-        if self._timer is not None:
-            self._timer.cancel()
-        left = self._operation.wake_in()
-        self._timer = None if left is None else self._loop.call_later(left, self._step)
 
     def _step(self) -> None:
         if self.ended.done():
@@ -85,20 +139,31 @@ class _Waiter:
             self.ended.set_exception(error)
             return
         if done is None:
-            self._set_timer()
+            self._reader.set_timer()
         else:
             self.ended.set_result(done)
 
 
-async def drive(operation: _sinew.Operation) -> Any:
+async def drive(operation: _sinew.Operation, reader: _Reader) -> Any:
     """Runs an operation to its end. Cancelling the task cancels it."""
     done = operation.poll()
     if done is None:
         try:
-            done = await _Waiter(operation).wait()
+            done = await _Waiter(operation, reader).wait()
         finally:
             operation.cancel()
     return None if done is None else done[0]
+
+
+async def begin(registration: _sinew.Operation) -> AsyncEndpoint:
+    """Runs a registration to its end."""
+    reader = _Reader()
+    try:
+        core = await drive(registration, reader)
+    finally:
+        # At once: the endpoint has the same descriptor, and a reader of its own.
+        reader.remove_if_idle()
+    return AsyncEndpoint(core)
 
 
 class AsyncEndpoint:
@@ -122,6 +187,7 @@ class AsyncEndpoint:
         self._lock = asyncio.Lock()
         self._waiting = 0
         """Calls that wait for the end of a `receive`."""
+        self._reader = _Reader()
         self._receiving: Optional[_Waiter] = None
         self._kept: Deque[Message] = deque()
         """Messages that arrived in the moment in which their `receive` was cancelled."""
@@ -136,7 +202,7 @@ class AsyncEndpoint:
         finally:
             self._waiting -= 1
         try:
-            return await drive(start())
+            return await drive(start(), self._reader)
         finally:
             self._lock.release()
 
@@ -249,7 +315,7 @@ class AsyncEndpoint:
         done = operation.poll()
         if done is not None:
             return done
-        waiter = self._receiving = _Waiter(operation)
+        waiter = self._receiving = _Waiter(operation, self._reader)
         try:
             return await waiter.wait(deadline)
         except asyncio.CancelledError:
@@ -348,6 +414,10 @@ class AsyncEndpoint:
     async def set_parameters(self, app: Destination, values: Mapping[str, Any], within: float = WITHIN) -> Applied:
         """Sets parameters of an application, all or none. Raises `ParameterError` with the reason if it refuses."""
         return await self._run(self._plans.set_parameters(app, values, within))
+
+    async def tick(self) -> None:
+        """Begins a turn of the loop that reads the parameters of this application, like `Endpoint.tick`."""
+        await self._run(self._plans.tick())
 
     async def set_together(
         self, sets: Mapping[str, Mapping[str, Any]], *, lead: float = LEAD, within: float = 2.0

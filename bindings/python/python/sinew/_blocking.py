@@ -83,7 +83,7 @@ class Endpoint:
         A name is looked up with each call: in a loop `resolve` it once.
         """
         options = Options(class_, room_within, expires_after)
-        self._run(self._plans.send(outgoing(to, what, value, options)))
+        self._core.send_now(outgoing(to, what, value, options))
 
     def send_confirmed(
         self,
@@ -124,8 +124,8 @@ class Endpoint:
         Control messages are first, then Stream, of which only the newest value of each source and type is kept, then Bulk.
         Raises `DisconnectedError` once when the node has gone; later calls wait for its return.
         """
-        done = self._core.receive().run(within)
-        return None if done is None else Message(done[0])
+        received = self._core.receive_now(within)
+        return None if received is None else Message(received)
 
     def __iter__(self) -> Iterator[Message]:
         while True:
@@ -224,6 +224,14 @@ class Endpoint:
     def set_parameters(self, app: Destination, values: Mapping[str, Any], within: float = WITHIN) -> Applied:
         """Sets parameters of an application, all or none. Raises `ParameterError` with the reason if it refuses."""
         return self._run(self._plans.set_parameters(app, values, within))
+
+    def tick(self) -> None:
+        """Begins a turn of the loop that reads the parameters of this application: sets that wait are applied now.
+
+        All values that the turn reads belong together. A program that serves parameters also receives, at least every
+        20 ms if it takes part in transactions.
+        """
+        self._run(self._plans.tick())
 
     def set_together(
         self, sets: Mapping[str, Mapping[str, Any]], *, lead: float = LEAD, within: float = 2.0

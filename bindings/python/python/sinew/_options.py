@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
-from typing import List, Optional, TypedDict
+from typing import TYPE_CHECKING, List, Optional, Tuple, TypedDict
+
+if TYPE_CHECKING:
+    from ._sinew import ParameterSet
+
+NamedType = Tuple[str, Optional[bytes]]
+"""The name of a type, and the bytes of its structure if that is known."""
 
 
 class RegisterOptions(TypedDict):
@@ -10,7 +16,9 @@ class RegisterOptions(TypedDict):
 
     name: Optional[str]
     requires: List[str]
-    handles: List[str]
+    handles: List[NamedType]
+    sends: List[NamedType]
+    parameters: Optional[Tuple[ParameterSet, float]]
     node_events: bool
     requirement_events: bool
     deadline: float
@@ -20,6 +28,7 @@ class RegisterOptions(TypedDict):
     socket_only: bool
     reconnect: bool
     own_user_only: bool
+    direct: str
 
 
 class ProtectedOptions(TypedDict):

@@ -65,7 +65,8 @@ def outgoing(to: Destination, what: Any, value: Any, options: Options = DEFAULT)
     if isinstance(what, str):
         kind, number, expires = kind_id(what), 0, None
         content = {} if value is _NOTHING else value
-        properties = payload_type(class_of_kind(kind))
+        cls = class_of_kind(kind)
+        properties = None if cls is None else payload_type(cls)
     else:
         if value is not _NOTHING:
             raise TypeError("give the name of a type and its value, or one value of a payload class")
@@ -113,6 +114,9 @@ class Plans:
     def resolve(self, name: str, within: float) -> Plan[Optional[Tid]]:
         bits = yield lambda: self.core.resolve(name, within)
         return None if bits is None else Tid(bits)
+
+    def tick(self) -> Plan[None]:
+        yield lambda: self.core.tick()
 
     def set_member(self, group: str, is_member: bool) -> Plan[None]:
         yield lambda: self.core.set_member(group, is_member)
@@ -199,8 +203,11 @@ class Plans:
             return None
         root, types = _sinew.parse_schema(schema)
         cls = from_schema(name, root, types)
+        if cls is None:
+            return None
+        cls.__sinew_structure__ = schema  # type: ignore[attr-defined]
         # The class of messages is no part of a structure.
-        return None if cls is None else register_class(cls, PayloadType(name, kind_id(name), 0, None))
+        return register_class(cls, PayloadType(name, kind_id(name), 0, None))
 
     def _schema(self, name: str, within: float) -> Plan[Optional[bytes]]:
         """Asks the own node for the structure of a type, and the node of a user that has it, if the own one has not."""

@@ -49,13 +49,17 @@ class PayloadType:
 
 _CLASSES: Dict[int, type] = {}
 _NAMES: Dict[int, str] = {}
+_KINDS: Dict[str, int] = {}
 
 
 def kind_id(name: str) -> int:
     """Returns the id of the type of this name, and keeps the name for messages of the type."""
-    kind = _sinew.kind_of(name)
-    if kind not in _NAMES and len(_NAMES) < KINDS_MAX:
-        _NAMES[kind] = name
+    kind = _KINDS.get(name)
+    if kind is None:
+        kind = _sinew.kind_of(name)
+        if len(_KINDS) < KINDS_MAX:
+            _KINDS[name] = kind
+            _NAMES.setdefault(kind, name)
     return kind
 
 
@@ -116,12 +120,17 @@ def register_class(cls: Type[T], properties: PayloadType) -> Type[T]:
 
 def to_wire(value: Any) -> Any:
     """Returns a value of MessagePack for a dataclass, an enum, or a value of numpy; others are returned as they are."""
+    known = type(value).__dict__.get("__sinew_fields__")
+    if known is not None:
+        return {wire: getattr(value, name) for name, wire in known}
     variant = getattr(type(value), "__sinew_variant__", None)
     if variant is not None:
         name, is_one_value = variant
         return {name: value.value if is_one_value else _fields(value)}
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return _fields(value)
+        fields = [(field.name, field.metadata.get("wire", field.name)) for field in dataclasses.fields(value)]
+        type(value).__sinew_fields__ = fields  # type: ignore[attr-defined]
+        return {wire: getattr(value, name) for name, wire in fields}
     if isinstance(value, enum.Enum):
         return value.value
     if isinstance(value, (set, frozenset)):

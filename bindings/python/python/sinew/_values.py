@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import enum
-from typing import Union
+from typing import Dict, Union
 
 from . import _sinew
 
@@ -111,16 +111,18 @@ class MessageClass(enum.Enum):
     """In order, after the other classes."""
 
 
-_NUMBERS = {MessageClass.CONTROL: 0, MessageClass.STREAM: 1, MessageClass.BULK: 2}
+_NUMBERS: Dict[Union[str, MessageClass], int] = {}
+for _number, _class in enumerate(MessageClass):
+    _NUMBERS[_class] = _NUMBERS[_class.value] = _number
 
 
 def class_number(name: Union[str, MessageClass]) -> int:
     """Returns the number of a class for the extension module."""
-    try:
-        return _NUMBERS[MessageClass(name)]
-    except ValueError:
+    number = _NUMBERS.get(name)
+    if number is None:
         names = ", ".join(repr(each.value) for each in MessageClass)
-        raise ValueError(f"{name!r} is no class of messages: take one of {names}") from None
+        raise ValueError(f"{name!r} is no class of messages: take one of {names}")
+    return number
 
 
 def class_of_number(number: int) -> MessageClass:
