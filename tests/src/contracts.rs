@@ -3,8 +3,8 @@
 //!
 //! The processes share the monotonic clock of the machine, so one clock measures the time from the last command, or
 //! from the order to stop, to a safe output. The times are upper bounds: the last command before a kill or a pause was
-//! sent up to one period earlier, and that period is added. Commands become late when the echoes that they quote do: the
-//! time counts from the first echo that is held back.
+//! sent up to one period earlier, and that period is added. Commands become late when the echoes that they quote
+//! do: the time counts from the first echo that is held back.
 
 mod node;
 mod report;

@@ -164,7 +164,7 @@ mod tests {
     }
 
     #[test]
-    fn stopped_node_is_named_if_the_entry_node_knows_no_press() {
+    fn stopped_node_is_named_without_a_known_press() {
         let unknown = stop(StopState::Released, 0);
         let line = "STOPPED at hip; no confirmations are known: the entry node does not know the press\n";
         assert_eq!((unknown.lines().as_str(), unknown.cell(HIP)), (line, None));

@@ -141,7 +141,7 @@ fn options_of_containers_are_explained() {
 }
 
 #[test]
-fn container_to_develop_in_has_the_tools_of_the_checks() {
+fn development_container_has_the_tools_of_checks() {
     let run = read(".ci/run");
     let (_, rest) = run.split_once("tools=(\n").expect("it has a list of tools");
     let (tools, _) = rest.split_once("\n)").expect("the list ends");

@@ -49,7 +49,7 @@ fn port() -> Arc<CommandPort> {
 }
 
 #[test]
-fn only_the_group_of_the_present_process_has_the_name() {
+fn only_the_present_group_has_the_name() {
     let port = port();
     assert_eq!(port.claim(KNEE, 1, Some(GROUP)), Err(ClaimError::Stray(1)), "no process was started");
     let first = port.begin(GROUP);
@@ -107,7 +107,7 @@ fn presence_follows_the_registered_process() {
 }
 
 #[test]
-fn program_is_probed_and_its_frames_are_signs_of_life() {
+fn frames_of_a_program_are_signs_of_life() {
     let (port, queue) = (port(), Arc::new(PlayedQueue::default()));
     let own = Tid::new(sinew_runtime::tid::NodeAddress::new(1), AppAddress::new(0x1001));
     port.begin(GROUP);

@@ -1,5 +1,5 @@
-//! Loses, pauses, delays and stops the sender of two outputs on other nodes many times, and reports the time until each output
-//! was safe against the time of its contract.
+//! Loses, pauses, delays and stops the sender of two outputs on other nodes many times, and reports the time until each
+//! output was safe against the time of its contract.
 //!
 //! `cargo run --release -p sinew-tests -- contracts [OPTIONS]`.
 //!

@@ -222,7 +222,7 @@ mod tests {
     }
 
     #[test]
-    fn long_line_is_cut_and_the_next_one_is_whole() {
+    fn long_line_is_cut_and_the_next_is_whole() {
         let long = [b'x'; 3 * LINE_BYTES_MAX];
         let found = lines(&[&long, b"y\nnext\n"]);
         assert_eq!(found[0], format!("{}...", "x".repeat(LINE_BYTES_MAX)));

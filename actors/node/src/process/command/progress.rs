@@ -115,7 +115,7 @@ mod tests {
     }
 
     #[test]
-    fn idle_program_is_probed_and_unknown_reader_is_left_alone() {
+    fn idle_program_of_a_known_reader_is_probed() {
         let idle = verdicts((0..9).map(|_| signs(5, Some(0), 0)));
         let probes = idle.iter().map(|it| *it == Verdict::Idle).collect::<Vec<_>>();
         assert_eq!(probes, [true, false, false, false, true, false, false, false, true]);
