@@ -83,13 +83,18 @@ fn stop(endpoint: Endpoint, received: Received) -> ExitCode {
 }
 
 fn execute(order: &Order) {
-    match order {
-        Order::Exit(code) => std::process::exit(*code),
-        Order::Kill => signal_myself(Signal::KILL),
-        Order::Hang => loop {
+    if let Order::Exit(code) = order {
+        std::process::exit(*code);
+    }
+    if matches!(order, Order::Kill) {
+        signal_myself(Signal::KILL);
+    }
+    if matches!(order, Order::Hang) {
+        loop {
             std::thread::sleep(Duration::from_secs(60));
-        },
-        Order::StartASleeper(in_own_group) => start_a_sleeper(*in_own_group),
-        _ => {}
+        }
+    }
+    if let Order::StartASleeper(in_own_group) = order {
+        start_a_sleeper(*in_own_group);
     }
 }
