@@ -9,7 +9,15 @@ mod outcomes;
 mod sink;
 mod writing;
 
-use std::{future::poll_fn, io, ops::ControlFlow, pin::pin, rc::Rc, sync::Arc, time::Duration};
+use std::{
+    future::{pending, poll_fn},
+    io,
+    ops::ControlFlow,
+    pin::pin,
+    rc::Rc,
+    sync::Arc,
+    time::Duration,
+};
 
 use rustix::net::Shutdown;
 use sinew_model::{cause::Cause, facts::User};
@@ -243,6 +251,7 @@ impl Client {
     /// Serves the client until its connection or its process ends.
     async fn live(&mut self, mut reader: Reader, session: &mut Session) -> ConnectionEnd {
         let (process, stream) = (self.watch_process(), self.peer.stream.clone());
+        let (command, id) = (self.command.clone(), self.peer.id);
         let served = async {
             match self.wait_at_barrier(&mut reader, session).await {
                 Some(end) => end,
@@ -253,7 +262,7 @@ impl Client {
         let end = tokio::select! {
             end = &mut served => end,
             // spec: LNCL-15
-            () = process.ended() => {
+            () = ended(&process, command.as_deref(), id) => {
                 // A child of the process may hold the socket open, so it is shut down here. An error means that it
                 // already was. Frames that the process sent before its end have arrived, and are still handled.
                 let _ = rustix::net::shutdown(&stream, Shutdown::Both);
@@ -442,6 +451,21 @@ impl Client {
         let ready = self.command.as_ref().is_some_and(|port| port.awaits_ready());
         let registered = Registered { node, app, node_name, payload_max, ring, types, ready };
         payload::frame(Kind::LNCL_REGISTERED, payload::lncl_of(node), self.tid, &registered)
+    }
+}
+
+/// Resolves when the process has ended, or when its connection has lost the name of a command. A process that has left
+/// its group outlives its command. The next process has the same TID, and only one may send from that. spec: LNCL-22
+async fn ended(process: &ProcessWatch, command: Option<&CommandPort>, id: ClientId) {
+    let lost = async {
+        match command {
+            Some(port) => port.lost(id).await,
+            None => pending().await,
+        }
+    };
+    tokio::select! {
+        () = process.ended() => {}
+        () = lost => {}
     }
 }
 

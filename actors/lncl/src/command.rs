@@ -223,6 +223,13 @@ impl CommandPort {
         is_holder
     }
 
+    /// Resolves when this connection does not have the name any more: its process has ended, or was killed.
+    pub(crate) async fn lost(&self, id: ClientId) {
+        let mut presence = self.presence();
+        // Each loss of the name is also a change of the presence.
+        while self.is_held_by(id) && presence.changed().await.is_ok() {}
+    }
+
     /// Takes the name from whichever connection has it: that ended with its LNCL.
     pub(crate) fn release_any(&self) {
         self.clear_holder(&mut lock(&self.state));

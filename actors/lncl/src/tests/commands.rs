@@ -92,6 +92,23 @@ fn stray_process_is_refused_the_name_of_a_command() {
 
 // spec: LNCL-22
 #[test]
+fn process_that_outlives_its_command_is_disconnected() {
+    let node = TestNode::start();
+    let (port, tid) = command(&node);
+    let first = port.begin(own_group());
+    let (mut former, _) = RawClient::register(&node, &named("knee"));
+    wait_for(&port, Presence::Registered);
+    // When: the process that the node started has ended, and this one has left its group
+    port.end(first);
+    // Then: it sends nothing more from the address of the next one
+    assert!(former.next().is_none());
+    port.begin(own_group());
+    let (_client, own) = RawClient::register(&node, &named("knee"));
+    assert_eq!(own, tid);
+}
+
+// spec: LNCL-22
+#[test]
 fn command_states_requirements_and_address_itself() {
     let node = TestNode::start();
     let (port, tid) = command(&node);

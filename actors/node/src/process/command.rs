@@ -121,8 +121,8 @@ async fn run(command: Arc<Command>, ready: ReadyGate, stop: Rc<Notify>) -> Reaso
         Err(why) => return Reason::ProcessEnded(format!("it could not be watched: {why}")),
     };
     sinew_runtime::log::debug!(app = command.name, pid = leader, "a process was started");
-    match Child::new(command, leader, ready, (socket, output)) {
-        Ok(child) => child.run(&process, &stop).await,
+    match Child::new(command, Rc::new(process), leader, ready, (socket, output)) {
+        Ok(child) => child.run(&stop).await,
         Err(why) => Reason::ProcessEnded(format!("it could not be listened to: {why}")),
     }
 }
@@ -130,6 +130,7 @@ async fn run(command: Arc<Command>, ready: ReadyGate, stop: Rc<Notify>) -> Reaso
 /// The process of a command, as long as it lives.
 struct Child {
     command: Arc<Command>,
+    process: Rc<Process>,
     /// The number of the process at its port.
     number: u64,
     presence: watch::Receiver<Presence>,
@@ -144,6 +145,8 @@ struct Child {
 
 impl Drop for Child {
     fn drop(&mut self) {
+        // Killed before its connection is ended: it handles no message that gets another outcome there.
+        self.process.kill();
         self.command.port.end(self.number);
     }
 }
@@ -151,6 +154,7 @@ impl Drop for Child {
 impl Child {
     fn new(
         command: Arc<Command>,
+        process: Rc<Process>,
         leader: i32,
         ready: ReadyGate,
         (socket, output): (std::os::unix::net::UnixStream, Option<Output>),
@@ -161,11 +165,23 @@ impl Child {
         let number = command.port.begin(leader);
         let presence = command.port.presence();
         let (ready, register_until, is_stopping) = (Some(ready), None, false);
-        Ok(Self { command, number, presence, ready, launch, output, progress, register_until, is_stopping })
+        Ok(Self {
+            command,
+            process,
+            number,
+            presence,
+            ready,
+            launch,
+            output,
+            progress,
+            register_until,
+            is_stopping,
+        })
     }
 
     /// Serves the process until it has ended, or is to be killed. Returns the reason.
-    async fn run(mut self, process: &Process, stop: &Notify) -> Reason {
+    async fn run(mut self, stop: &Notify) -> Reason {
+        let process = self.process.clone();
         let mut ended = pin!(process.wait());
         let status = loop {
             tokio::select! {
