@@ -164,6 +164,7 @@ impl Child {
         let progress = ProgressTimeout::new(command.progress_within, Instant::now());
         let number = command.port.begin(leader);
         let presence = command.port.presence();
+        launch.allow();
         let (ready, register_until, is_stopping) = (Some(ready), None, false);
         Ok(Self {
             command,

@@ -1,9 +1,10 @@
 //! Becomes the program of a command: the program replaces this process.
 
 use std::{
-    io::Write as _,
+    io::{self, Read as _, Write as _},
     os::unix::{net::UnixStream, process::CommandExt},
     process::Command,
+    time::Duration,
 };
 
 use rustix::{
@@ -20,6 +21,8 @@ const SOCKET: &str = "SINEW_SOCKET";
 const NAME: &str = "SINEW_NAME";
 /// The exit code of a program that could not be executed, as of a shell.
 const EXIT_CODE: i32 = 127;
+/// Deadline of the node's permission to begin.
+const PERMISSION_TIMEOUT: Duration = Duration::from_secs(10);
 
 /// Becomes the program of the command `app`. If that fails, writes the reason to the node, and ends this process.
 pub(super) fn become_program(
@@ -49,9 +52,15 @@ fn execute(config: &NodeConfig, app: &str, line: &CommandLine, socket: &UnixStre
             "the kernel does not bind it to its node (prctl): {cause}; use a seccomp profile that allows this call"
         );
     }
-    if has_hung_up(socket) {
+    match wait_until_allowed(socket, PERMISSION_TIMEOUT) {
+        Ok(()) if !has_hung_up(socket) => {}
+        Err(cause) if cause.kind() != io::ErrorKind::UnexpectedEof => {
+            return format!(
+                "its node has not let it begin within {PERMISSION_TIMEOUT:?}: {cause}; find what holds up the node"
+            );
+        }
         // The node died before that.
-        die();
+        Ok(()) | Err(_) => die(),
     }
     let (Some(path), [program, arguments @ ..]) = (&config.lncl.socket, &line.words[..]) else {
         return "there is no socket at which it could join; set `lncl.socket`".to_owned();
@@ -68,8 +77,30 @@ fn execute(config: &NodeConfig, app: &str, line: &CommandLine, socket: &UnixStre
     format!("'{program}'{folder} cannot be executed: {cause}; write its path, or add its folder to PATH")
 }
 
+/// Waits for the byte by which the node lets the program begin: its group may register the name by then.
+fn wait_until_allowed(mut socket: &UnixStream, within: Duration) -> io::Result<()> {
+    socket.set_read_timeout(Some(within))?;
+    socket.read_exact(&mut [0])
+}
+
 /// Returns whether the node's end of the socket is closed.
 fn has_hung_up(socket: &UnixStream) -> bool {
     let now = Timespec { tv_sec: 0, tv_nsec: 0 };
     poll(&mut [PollFd::new(socket, PollFlags::RDHUP)], Some(&now)) == Ok(1)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn program_begins_only_when_its_node_allows_it() {
+        let (mut node, socket) = UnixStream::pair().expect("a pair");
+        let wait = |within| wait_until_allowed(&socket, within).map_err(|cause| cause.kind());
+        assert_eq!(wait(Duration::from_millis(1)), Err(io::ErrorKind::WouldBlock));
+        node.write_all(&[0]).expect("it has room");
+        assert_eq!(wait(PERMISSION_TIMEOUT), Ok(()));
+        drop(node);
+        assert_eq!(wait(PERMISSION_TIMEOUT), Err(io::ErrorKind::UnexpectedEof));
+    }
 }

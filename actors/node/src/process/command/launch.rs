@@ -2,6 +2,7 @@
 
 use std::io;
 
+use rustix::net::SendFlags;
 use tokio::net::UnixStream;
 
 /// Maximum bytes of a reason that are kept.
@@ -19,6 +20,13 @@ impl LaunchReport {
     pub(super) fn new(socket: std::os::unix::net::UnixStream) -> io::Result<Self> {
         socket.set_nonblocking(true)?;
         Ok(Self { socket: Some(UnixStream::from_std(socket)?), reason: Vec::new() })
+    }
+
+    /// Lets the process execute the program. Its group may register the name by now, and its presence is watched.
+    pub(super) fn allow(&self) {
+        let flags = SendFlags::DONTWAIT | SendFlags::NOSIGNAL;
+        // The socket has room for this byte. An error means that the process has ended, which its exit status shows.
+        self.socket.iter().for_each(|socket| _ = rustix::net::send(socket, &[0], flags));
     }
 
     /// Reads when something has arrived; never resolves once the other end is closed.
@@ -58,9 +66,25 @@ impl LaunchReport {
 
 #[cfg(test)]
 mod tests {
-    use std::io::Write as _;
+    use std::io::{Read as _, Write as _};
 
     use super::*;
+
+    #[test]
+    fn process_gets_one_byte_when_it_may_begin() {
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().expect("a runtime");
+        let (ours, mut theirs) = std::os::unix::net::UnixStream::pair().expect("a pair");
+        let mut read = Vec::new();
+        runtime.block_on(async {
+            let report = LaunchReport::new(ours).expect("it is ours");
+            theirs.set_nonblocking(true).expect("it is ours");
+            let early = theirs.read(&mut [0]).map_err(|cause| cause.kind());
+            assert_eq!(early, Err(io::ErrorKind::WouldBlock), "it may not begin yet");
+            report.allow();
+        });
+        theirs.read_to_end(&mut read).expect("the other end is closed");
+        assert_eq!(read.len(), 1);
+    }
 
     #[test]
     fn closed_socket_without_a_reason_is_a_success() {
