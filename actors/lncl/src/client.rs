@@ -192,10 +192,10 @@ impl Client {
         let address = address.map_or(any, Address::Fixed);
         let (owner, user) = (peer.owner(), User::of(uid, own));
         let request = Request { address, name, requires: requires.clone(), kinds, owner, user };
-        let called = request.name.clone();
+        let (called, from) = (request.name.clone(), (peer.id, peer.pid, &*peer.stream));
         let command = called.as_deref().and_then(|name| server.state.commands.named(name));
         let app = match &command {
-            Some(port) => registrar::claim_command(&server.state, port, (peer.id, peer.pid), &request)?,
+            Some(port) => registrar::claim_command(&server.state, port, from, &request)?,
             None => registrar::register_client(&server.state, request)?,
         };
         if let Some(access) = server.state.security.access.get() {

@@ -10,6 +10,7 @@ use std::{
 };
 
 use rustix::{
+    event::{PollFd, PollFlags, Timespec, poll},
     io::Errno,
     process::{Pid, PidfdFlags, pidfd_open},
 };
@@ -84,6 +85,18 @@ impl ProcessWatch {
     }
 }
 
+/// Returns whether the process behind `socket` has ended, as far as the kernel reports it (Linux 6.5). Its number may
+/// belong to another process then.
+pub(crate) fn has_ended(socket: impl AsFd) -> bool {
+    match sinew_shm::peer_pidfd(socket) {
+        Ok(pidfd) => {
+            let now = Timespec { tv_sec: 0, tv_nsec: 0 };
+            poll(&mut [PollFd::new(&pidfd, PollFlags::IN)], Some(&now)) == Ok(1)
+        }
+        Err(cause) => fallback(Errno::from_io_error(&cause), 0, gives_pidfds_of_peers) == Fallback::Over,
+    }
+}
+
 /// The fallback if the kernel gives no descriptor of the process behind a socket.
 #[derive(Debug, PartialEq)]
 enum Fallback {
@@ -128,6 +141,12 @@ fn unwatched(cause: &io::Error) -> io::Error {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn living_process_has_not_ended() {
+        let (own, _other) = UnixStream::pair().unwrap();
+        assert!(!has_ended(&own));
+    }
 
     #[test]
     fn process_with_a_pid_is_watched_by_it() {

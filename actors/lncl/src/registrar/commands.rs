@@ -11,11 +11,13 @@ use sinew_runtime::{
     wire::Kind,
 };
 use sinew_session::book::ClientId;
+use tokio::net::UnixStream;
 
 use super::{
     super::{
         command::{ClaimError, CommandPort, HandOver},
         core::{Address, Owner, RegisterError, Request},
+        process_watch::has_ended,
     },
     LocalApp, limits, notify_handled, register_own,
 };
@@ -40,13 +42,15 @@ pub fn register_command(state: &State, app: LocalApp, port: Arc<CommandPort>) ->
 pub(crate) fn claim_command(
     state: &State,
     port: &CommandPort,
-    (id, pid): (ClientId, i32),
+    (id, pid, socket): (ClientId, i32, &UnixStream),
     request: &Request,
 ) -> Result<AppAddress, RegisterError> {
     let refused = |why| RegisterError::Command { name: port.name().to_owned(), why };
     // Only the node's own user has a process in a group that the node started.
     let is_own = request.user == User::Own;
     let group = Pid::from_raw(pid).filter(|_| is_own).and_then(|pid| getpgid(Some(pid)).ok());
+    // Checked after its group was read: as long as the process lives, no other one has its number.
+    let group = group.filter(|_| !has_ended(socket));
     let mut registry = lock(&state.registry);
     let Some(app) = registry.resolve(port.name()) else { return Err(refused(ClaimError::Stray(pid))) };
     port.claim(id, pid, group.map(|group| group.as_raw_nonzero().get())).map_err(refused)?;

@@ -7,7 +7,7 @@ use super::*;
 use crate::{CommandPort, LocalApp, Presence, register_command};
 
 /// Registers the command `knee`. Its program has to call `ready`.
-fn command(node: &TestNode) -> (Arc<CommandPort>, Tid) {
+pub(super) fn command(node: &TestNode) -> (Arc<CommandPort>, Tid) {
     let port = CommandPort::new("knee", Mailbox::new(8), true);
     let app = LocalApp {
         name: Some("knee".to_owned()),
