@@ -116,6 +116,12 @@ struct PortState {
     is_more_to_hand_over: bool,
 }
 
+impl PortState {
+    fn is_held_by(&self, id: ClientId) -> bool {
+        self.holder == Some(id) && self.group.is_some()
+    }
+}
+
 #[derive(Clone)]
 struct Receiver {
     queue: Arc<dyn HandOver>,
@@ -165,6 +171,25 @@ impl CommandPort {
         }
     }
 
+    /// Lets no process register the name, after the end of this one, and hands over nothing more. Resolves when the
+    /// node has handled all that the process sent. LNCL may hang, so the caller needs a deadline.
+    pub async fn retire(&self, process: u64) {
+        let mut presence = self.presence();
+        {
+            let mut state = lock(&self.state);
+            if state.process == process {
+                (state.group, state.receiver) = (None, None);
+                // Its connection drains what has arrived, and releases the name.
+                self.presence.send_modify(|_| ());
+            }
+        }
+        let is_left = || {
+            let state = lock(&self.state);
+            state.process == process && state.holder.is_some()
+        };
+        while is_left() && presence.changed().await.is_ok() {}
+    }
+
     fn clear_holder(&self, state: &mut PortState) {
         (state.holder, state.receiver) = (None, None);
         self.presence.send_replace(Presence::Absent);
@@ -186,16 +211,16 @@ impl CommandPort {
         Ok(())
     }
 
-    /// Returns whether this connection has the name.
+    /// Returns whether this connection has the name, and its process has not ended.
     pub(crate) fn is_held_by(&self, id: ClientId) -> bool {
-        lock(&self.state).holder == Some(id)
+        lock(&self.state).is_held_by(id)
     }
 
     /// Hands messages to the queue of this connection from now on. Returns whether it has the name.
     pub(crate) fn open(&self, id: ClientId, queue: Arc<dyn HandOver>) -> bool {
         {
             let mut state = lock(&self.state);
-            if state.holder != Some(id) {
+            if !state.is_held_by(id) {
                 return false;
             }
             state.receiver = Some(Receiver { queue, reader: Arc::new(self.mailbox.attach_remote()) });
@@ -208,7 +233,7 @@ impl CommandPort {
     /// Records that the program of this connection has called `ready`.
     pub(crate) fn ready(&self, id: ClientId) {
         let state = lock(&self.state);
-        if state.holder == Some(id) {
+        if state.is_held_by(id) {
             self.presence.send_replace(Presence::Ready);
         }
     }

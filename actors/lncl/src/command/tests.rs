@@ -1,6 +1,10 @@
 //! The place of a command, with a played connection.
 
-use std::sync::atomic::AtomicBool;
+use std::{
+    pin::pin,
+    sync::atomic::AtomicBool,
+    task::{Context, Waker},
+};
 
 use bytes::Bytes;
 use sinew_runtime::{
@@ -135,4 +139,22 @@ fn reply_of_a_former_process_is_dropped() {
     assert!(lock(&queue.taken).is_empty());
     port.submit(reply()).unwrap();
     assert_eq!(*lock(&queue.taken), [9]);
+}
+
+#[test]
+fn process_is_retired_when_its_connection_has_ended() {
+    let (port, queue) = (port(), Arc::new(PlayedQueue::default()));
+    let process = port.begin(GROUP);
+    port.claim(KNEE, 1, Some(GROUP)).unwrap();
+    port.open(KNEE, queue.clone());
+    let mut retired = pin!(port.retire(process));
+    let mut is_retired = || retired.as_mut().poll(&mut Context::from_waker(Waker::noop())).is_ready();
+    assert!(!is_retired(), "its connection may have frames of it");
+    assert!(!port.is_held_by(KNEE), "the connection learns that it has to end");
+    port.submit(message(1)).unwrap();
+    assert!(lock(&queue.taken).is_empty(), "it waits for the next process");
+    assert_eq!(port.claim(STRAY, 2, Some(GROUP)), Err(ClaimError::Stray(2)));
+    assert!(!is_retired());
+    assert!(port.release(KNEE));
+    assert!(is_retired());
 }

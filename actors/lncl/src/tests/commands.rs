@@ -107,6 +107,23 @@ fn process_that_outlives_its_command_is_disconnected() {
     assert_eq!(own, tid);
 }
 
+#[test]
+fn messages_of_a_process_are_handled_before_its_end() {
+    const COUNT: usize = 8;
+    let node = TestNode::start();
+    let ((port, _), app) = (command(&node), node.local(1));
+    let process = port.begin(own_group());
+    let (mut client, own) = RawClient::register(&node, &named("knee"));
+    wait_for(&port, Presence::Registered);
+    (0..COUNT).for_each(|_| client.send(&Message::typed(own, app.tid, &Angle { degrees: 1.0 })));
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_time().build().expect("a runtime");
+    let retired = async { tokio::time::timeout(WATCHDOG, port.retire(process)).await };
+    runtime.block_on(retired).expect("its connection ends in time");
+    for number in 0..COUNT {
+        assert!(app.next_within(Duration::ZERO).is_some(), "message {number} would come after its last will");
+    }
+}
+
 // spec: LNCL-22
 #[test]
 fn command_states_requirements_and_address_itself() {

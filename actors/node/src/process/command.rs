@@ -22,7 +22,7 @@ use sinew_runtime::{
 };
 use tokio::{
     sync::{Notify, watch},
-    time::Instant,
+    time::{Instant, timeout},
 };
 
 use self::{
@@ -37,6 +37,9 @@ use super::{
     variable,
 };
 use crate::NodeState;
+
+/// Deadline for the frames that a process sent before its end. LNCL takes at most 100 ms for them.
+const LAST_FRAMES_TIMEOUT: Duration = Duration::from_millis(150);
 
 /// A command of the node, for each of its processes.
 pub(crate) struct Command {
@@ -180,8 +183,17 @@ impl Child {
         })
     }
 
-    /// Serves the process until it has ended, or is to be killed. Returns the reason.
+    /// Serves the process to its end. Returns the reason when all that it sent is handled: its last wills follow that.
     async fn run(mut self, stop: &Notify) -> Reason {
+        let reason = self.serve(stop).await;
+        self.process.kill();
+        // A deadline, since LNCL itself may hang. What is left then is handled later.
+        let _ = timeout(LAST_FRAMES_TIMEOUT, self.command.port.retire(self.number)).await;
+        reason
+    }
+
+    /// Serves the process until it has ended, or is to be killed. Returns the reason.
+    async fn serve(&mut self, stop: &Notify) -> Reason {
         let process = self.process.clone();
         let mut ended = pin!(process.wait());
         let status = loop {
