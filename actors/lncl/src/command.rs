@@ -36,7 +36,14 @@ pub(crate) trait HandOver: MessageSink {
 
     /// Returns how far the client has read.
     fn reading(&self) -> Reading;
+
+    /// Has the task of the connection hand over further messages soon.
+    fn continue_later(&self);
 }
+
+/// Maximum number of messages that one call hands over. Otherwise a sender could have to hand over those of all others,
+/// as long as they send.
+const HAND_OVER_MAX: usize = 64;
 
 /// How far a client has read its messages.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -285,7 +292,7 @@ impl CommandPort {
     }
 
     /// Hands over as many messages as the program's connection takes. It stops where that has no room, and continues
-    /// when the connection has written all.
+    /// when the connection has written all. After [`HAND_OVER_MAX`] messages the task of the connection continues.
     pub(crate) fn hand_over(&self) {
         {
             let mut state = lock(&self.state);
@@ -296,15 +303,22 @@ impl CommandPort {
                 return;
             }
         }
+        let mut left = HAND_OVER_MAX;
         loop {
             let receiver = lock(&self.state).receiver.clone();
             if let Some(receiver) = receiver {
-                receiver.take_all();
+                receiver.take_up_to(&mut left);
             }
+            // A call without room for a message counts, too.
+            left = left.saturating_sub(1);
             let mut state = lock(&self.state);
-            if !std::mem::take(&mut state.is_more_to_hand_over) {
+            let is_more = std::mem::take(&mut state.is_more_to_hand_over);
+            if left == 0 || !is_more {
                 state.is_handing_over = false;
-                return;
+                // That of the present process, which may be another one by now.
+                let receiver = state.receiver.clone().filter(|_| left == 0);
+                drop(state);
+                return receiver.into_iter().for_each(|receiver| receiver.queue.continue_later());
             }
         }
     }
@@ -332,10 +346,12 @@ impl CommandPort {
 }
 
 impl Receiver {
-    fn take_all(&self) {
-        while self.queue.is_free()
+    fn take_up_to(&self, left: &mut usize) {
+        while *left > 0
+            && self.queue.is_free()
             && let Some(message) = self.reader.take()
         {
+            *left -= 1;
             let class = message.header.class;
             let Err(SubmitError { mut message, why }) = self.queue.submit(message) else {
                 // From here on the connection knows where the message is.

@@ -254,6 +254,11 @@ impl<S: Socket> SocketWriter<S> {
         }
     }
 
+    /// Wakes the task that runs [`drain`](Self::drain), also if nothing is queued.
+    pub fn wake_drain(&self) {
+        self.with(|state, deferred| state.connection.wake_drainer(deferred));
+    }
+
     /// Sends `last` when the queue is empty. Later submissions are refused with [`Rejection::Closed`].
     pub fn finish(&self, last: Message) {
         self.with(|state, deferred| state.finish(last, deferred));

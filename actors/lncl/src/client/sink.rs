@@ -68,6 +68,10 @@ impl HandOver for ClientSink<ClientOutlet> {
             leaves_some: taking.leaves_some,
         })
     }
+
+    fn continue_later(&self) {
+        self.outlet.wake_drain();
+    }
 }
 
 #[cfg(test)]

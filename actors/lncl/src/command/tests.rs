@@ -22,6 +22,7 @@ const GROUP: i32 = 4_711;
 #[derive(Default)]
 struct PlayedQueue {
     is_full: AtomicBool,
+    is_to_continue: AtomicBool,
     taken: Mutex<Vec<u64>>,
 }
 
@@ -39,6 +40,10 @@ impl HandOver for PlayedQueue {
 
     fn reading(&self) -> Reading {
         Reading { mark: (lock(&self.taken).len() as u64, 0), unread: Some(0), leaves_some: false }
+    }
+
+    fn continue_later(&self) {
+        self.is_to_continue.store(true, Ordering::Relaxed);
     }
 }
 
@@ -157,4 +162,20 @@ fn process_is_retired_when_its_connection_has_ended() {
     assert!(!is_retired());
     assert!(port.release(KNEE));
     assert!(is_retired());
+}
+
+#[test]
+fn one_call_hands_over_a_limited_number() {
+    let queue = Arc::new(PlayedQueue::default());
+    let port = CommandPort::new("knee", Mailbox::new(2 * HAND_OVER_MAX), false);
+    let count = HAND_OVER_MAX as u64 + 1;
+    (1..=count).for_each(|number| port.submit(message(number)).unwrap());
+    port.begin(GROUP);
+    port.claim(KNEE, 1, Some(GROUP)).unwrap();
+    port.open(KNEE, queue.clone());
+    assert_eq!(lock(&queue.taken).len(), HAND_OVER_MAX);
+    assert!(queue.is_to_continue.swap(false, Ordering::Relaxed), "the task of the connection continues");
+    port.hand_over();
+    assert_eq!(*lock(&queue.taken), (1..=count).collect::<Vec<_>>());
+    assert!(!queue.is_to_continue.load(Ordering::Relaxed));
 }
