@@ -159,6 +159,11 @@ impl CommandPort {
         self.presence.subscribe()
     }
 
+    /// Rejects all messages from now on, with those that wait, or accepts them again.
+    pub fn set_refusing(&self, refuses: bool) {
+        if refuses { self.mailbox.refuse_while_down() } else { self.mailbox.accept_again() }
+    }
+
     /// Lets the processes of this group register the name, and no others. Returns the number of the process, which
     /// leads the group.
     pub fn begin(&self, group: i32) -> u64 {

@@ -179,3 +179,17 @@ fn one_call_hands_over_a_limited_number() {
     assert_eq!(*lock(&queue.taken), (1..=count).collect::<Vec<_>>());
     assert!(!queue.is_to_continue.load(Ordering::Relaxed));
 }
+
+#[test]
+fn refusing_command_has_no_stale_message_for_its_program() {
+    let (port, queue) = (port(), Arc::new(PlayedQueue::default()));
+    port.begin(GROUP);
+    port.submit(message(1)).unwrap();
+    port.set_refusing(true);
+    assert_eq!(port.submit(message(2)).unwrap_err().why, Rejection::Down);
+    port.claim(KNEE, 1, Some(GROUP)).unwrap();
+    port.open(KNEE, queue.clone());
+    port.set_refusing(false);
+    port.submit(message(3)).unwrap();
+    assert_eq!(*lock(&queue.taken), [3]);
+}

@@ -16,7 +16,7 @@ use std::{
 
 use sinew_lncl::{CommandPort, Presence};
 use sinew_runtime::{
-    app::{CommandReadiness, DynApp},
+    app::{CommandReadiness, DownPolicy, DynApp},
     supervision::{Launch, ReadyGate, Reason, RunningActor},
     tid::Tid,
 };
@@ -48,6 +48,8 @@ pub(crate) struct Command {
     tid: Tid,
     name: String,
     readiness: CommandReadiness,
+    /// Whether messages are rejected while no process is registered.
+    drops: bool,
     start_within: Duration,
     progress_within: Option<Duration>,
     predecessor: Arc<Predecessor>,
@@ -69,6 +71,7 @@ impl Command {
             tid,
             name: app.name().to_owned(),
             readiness,
+            drops: app.down_policy() == DownPolicy::Drop,
             start_within: policy.start_within,
             progress_within: policy.progress_within,
             predecessor: Arc::default(),
@@ -227,6 +230,10 @@ impl Child {
 
     fn on_presence(&mut self) {
         let presence = *self.presence.borrow_and_update();
+        if self.ready.is_none() && self.command.drops {
+            // From its end on, and until its next readiness, its supervisor does this.
+            self.command.port.set_refusing(presence == Presence::Absent);
+        }
         if presence == Presence::Absent {
             // Before its readiness the supervisor has the same deadline.
             if self.ready.is_none() && self.register_until.is_none() {

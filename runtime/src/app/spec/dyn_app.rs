@@ -6,7 +6,7 @@ use sinew_params::Parameters;
 
 use super::{AppWiring, CommandLine, Common, DynApp};
 use crate::{
-    app::{DownState, RequirementPolicy, WILLS_MAX, Will, contract},
+    app::{DownPolicy, DownState, RequirementPolicy, WILLS_MAX, Will, contract},
     supervision::{Launch, Place, Policy},
     tid::AppAddress,
     wire::{Kind, PayloadType},
@@ -132,6 +132,12 @@ impl DynApp {
             | RequirementPolicy::SafeState
             | RequirementPolicy::Restart => None,
         }
+    }
+
+    /// Returns the policy for messages while the application is down.
+    #[must_use]
+    pub const fn down_policy(&self) -> DownPolicy {
+        self.common.down_policy
     }
 
     /// Creates the state that the node keeps for the time when the application is down.
