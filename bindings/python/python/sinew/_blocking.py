@@ -272,7 +272,8 @@ class Endpoint:
         """Guards an output: it is live only while good messages of this type arrive from `source`.
 
         `safe` is called with the cause, on another thread, and makes the output safe. From now on `receive` returns only
-        good messages of this type from this sender, while the output is live.
+        good messages of this type from this sender, while the output is live. With `direct="always"` the stop of the
+        whole system does not reach the output. Raises `ForkedError` in the child of a process that has guards.
         """
         return make_guard(self._core, source, protected, safe)
 
@@ -291,7 +292,7 @@ class Endpoint:
         self._run(self._plans.unregister())
 
     def close(self) -> None:
-        """Releases the address at once."""
+        """Releases the address at once. Raises `BusyError` while another thread is in a call on this endpoint."""
         self._core.close()
 
     def __enter__(self) -> Endpoint:
