@@ -350,6 +350,8 @@ def test_endpoint_continues_after_a_restart_of_its_node(node: Any) -> None:
             assert other.resolve("drive") == drive.tid
             other.send(sinew.group("drives"), Torque(4.0))
             assert received(drive).value == Torque(4.0)
+        node.stop(signal.SIGKILL)
+        drive.serve(0.2)  # waits for the node, without an error
 
 
 def test_socket_without_rings_is_the_same(node: Any) -> None:

@@ -185,7 +185,8 @@ class AsyncEndpoint:
         """Waits for a message, at most `within` seconds; `None` if none arrived.
 
         Control messages are first, then Stream, of which only the newest value of each source and type is kept, then Bulk.
-        Raises `DisconnectedError` once when the node has gone; later calls wait for its return.
+        Raises `DisconnectedError` once when the node has gone; later calls wait for its return. While another task is in
+        `receive`, this one waits for its end, also beyond `within`.
         """
         loop = asyncio.get_running_loop()
         deadline = None if within is None else loop.time() + within

@@ -169,7 +169,12 @@ class Endpoint:
             return
         until = _sinew.now() + within
         while _sinew.now() < until:
-            message = self.receive(max(0.0, until - _sinew.now()))
+            try:
+                message = self.receive(max(0.0, until - _sinew.now()))
+            except DisconnectedError:
+                continue  # the next call waits for the node
+            except ClosedError:
+                return
             if message is not None:
                 yield message
 
