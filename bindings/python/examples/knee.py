@@ -1,7 +1,4 @@
-"""Shows the torque of the knee of the walking exoskeleton ten times a second, and how old each value is."""
-
 import asyncio
-
 import sinew
 
 

@@ -215,11 +215,18 @@ impl Writer {
     }
 
     fn list(&mut self, list: &Bound<'_, PyAny>, depth: usize) -> PyResult<()> {
-        write::write_array_len(&mut self.bytes, length(list.len()?)?).map_err(fault)?;
+        let stated = list.len()?;
+        write::write_array_len(&mut self.bytes, length(stated)?).map_err(fault)?;
+        let mut written = 0;
         for element in list.try_iter()? {
             self.value(&element?, depth + 1)?;
+            written += 1;
         }
-        Ok(())
+        if written == stated {
+            return Ok(());
+        }
+        let text = "a list has changed its length while it was written; do two threads use it? send a copy";
+        Err(PyValueError::new_err(text))
     }
 }
 

@@ -1,13 +1,12 @@
 //! An endpoint: each call begins one operation, which Python polls.
 
 use std::{
-    ops::{Deref, DerefMut},
     sync::{Arc, Mutex, PoisonError},
     time::Duration,
 };
 
 use pyo3::{exceptions::PyValueError, prelude::*, pybacked::PyBackedBytes};
-use sinew_client::{ApiError, AsyncEndpoint, Barrier, EventLoop, LoanedMessage, MessageBuilder, Transport};
+use sinew_client::{ApiError, AsyncEndpoint, Barrier, EventLoop, LoanedMessage, MessageBuilder};
 use sinew_model::barrier::OnPartyLoss;
 use sinew_runtime::{
     outcome::Outcome,
@@ -19,7 +18,8 @@ use sinew_runtime::{
 use crate::{
     errors,
     fork::Owner,
-    guard::{OutputGuard, ProtectedType, check_callback, safe_function},
+    guard::{OutputGuard, ProtectedType, check_may_guard, safe_function},
+    lease::{Facts, Lease},
     operation::{Done, Failure, Operation, Running, gone},
     parameters::{AnyValue, Registered},
     received::Received,
@@ -117,27 +117,6 @@ impl Draft {
     }
 }
 
-/// The properties of an endpoint, as of the end of its last operation.
-struct Facts {
-    tid: u64,
-    registrations: u64,
-    node_name: String,
-    payload_max: usize,
-    is_ring: bool,
-}
-
-impl Facts {
-    fn of(endpoint: &AsyncEndpoint) -> Self {
-        Self {
-            tid: endpoint.tid().bits(),
-            registrations: endpoint.registrations(),
-            node_name: endpoint.node_name().to_owned(),
-            payload_max: endpoint.payload_max(),
-            is_ring: endpoint.transport() == Transport::Ring,
-        }
-    }
-}
-
 /// An endpoint. One operation at a time.
 #[pyclass(frozen, module = "sinew._sinew")]
 pub(crate) struct Core {
@@ -148,36 +127,9 @@ pub(crate) struct Core {
     owner: Owner,
 }
 
-/// The endpoint, for one operation.
-struct Lease {
-    endpoint: tokio::sync::OwnedMutexGuard<Option<Registered>>,
-    facts: Arc<Mutex<Facts>>,
-}
-
-impl Deref for Lease {
-    type Target = Option<Registered>;
-
-    fn deref(&self) -> &Option<Registered> {
-        &self.endpoint
-    }
-}
-
-impl DerefMut for Lease {
-    fn deref_mut(&mut self) -> &mut Option<Registered> {
-        &mut self.endpoint
-    }
-}
-
-impl Drop for Lease {
-    fn drop(&mut self) {
-        if let Some(Registered { endpoint, .. }) = &*self.endpoint {
-            let mut facts = self.facts.lock().unwrap_or_else(PoisonError::into_inner);
-            // All others change with a registration alone.
-            if facts.registrations != endpoint.registrations() {
-                *facts = Facts::of(endpoint);
-            }
-        }
-    }
+fn busy(py: Python<'_>) -> PyErr {
+    let text = "another call on this endpoint is under way; register one endpoint for each thread";
+    errors::named(py, "BusyError", text)
 }
 
 impl Core {
@@ -192,10 +144,7 @@ impl Core {
             let text = "the endpoint belongs to the process that this one was forked from; register another one here";
             return Err(errors::named(py, "ForkedError", text));
         }
-        let endpoint = Arc::clone(&self.endpoint).try_lock_owned().map_err(|_| {
-            let text = "another call on this endpoint is under way; register one endpoint for each thread";
-            errors::named(py, "BusyError", text)
-        })?;
+        let endpoint = Arc::clone(&self.endpoint).try_lock_owned().map_err(|_| busy(py))?;
         if endpoint.is_none() {
             return Err(gone(py));
         }
@@ -232,10 +181,15 @@ impl Core {
 
 impl Drop for Core {
     fn drop(&mut self) {
-        // The end of a copy would close the connection of the parent.
+        let none = Arc::new(tokio::sync::Mutex::new(None));
+        let mut endpoint = Some(std::mem::replace(&mut self.endpoint, none));
         if self.owner.is_parent() {
-            std::mem::forget(Arc::clone(&self.endpoint));
+            // The end of a copy would close the connection of the parent.
+            std::mem::forget(endpoint);
+            return;
         }
+        // Without the GIL: its guards may wait for a safe function, which waits for the GIL.
+        let _ = Python::try_attach(|py| py.detach(|| drop(endpoint.take())));
     }
 }
 
@@ -454,7 +408,7 @@ impl Core {
         safe: Py<PyAny>,
     ) -> PyResult<OutputGuard> {
         let (protected, _) = payload_type.read()?;
-        check_callback(py)?;
+        check_may_guard(py)?;
         let mut lease = self.lease(py)?;
         let output = ((), safe_function(safe));
         let made = py.detach(move || {
@@ -488,10 +442,13 @@ impl Core {
         Ok(Operation::new(Box::pin(future), self.events.clone()))
     }
 
-    /// Releases the address at once. Has no effect on one that is released.
-    fn close(&self, py: Python<'_>) {
-        if let Ok(mut lease) = self.lease(py) {
-            py.detach(move || drop(lease.take()));
+    /// Releases the address at once. Has no effect on one that is released, and on a copy in the child of a fork.
+    fn close(&self, py: Python<'_>) -> PyResult<()> {
+        if !self.owner.is_parent() {
+            let endpoint = Arc::clone(&self.endpoint).try_lock_owned();
+            let mut endpoint = endpoint.map_err(|_| busy(py))?;
+            py.detach(move || drop(endpoint.take()));
         }
+        Ok(())
     }
 }

@@ -14,6 +14,20 @@ pub(crate) fn forked() {
     GENERATION.fetch_add(1, Ordering::Relaxed);
 }
 
+/// The generation of the first process with a guard, plus 1; 0: there is none.
+static FIRST_GUARD: AtomicU32 = AtomicU32::new(0);
+
+/// Returns whether this process may have guards. The thread that makes outputs safe starts with the first guard, and is
+/// not in the child of a fork.
+pub(crate) fn may_guard() -> bool {
+    let own = GENERATION.load(Ordering::Relaxed) + 1;
+    // SYNC: Relaxed; the number alone matters.
+    match FIRST_GUARD.compare_exchange(0, own, Ordering::Relaxed, Ordering::Relaxed) {
+        Ok(_) => true,
+        Err(first) => first == own,
+    }
+}
+
 /// The process that has made an object.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Owner(u32);

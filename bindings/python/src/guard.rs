@@ -16,7 +16,12 @@ use sinew_runtime::{
     wire::{Class, Kind},
 };
 
-use crate::{endpoint::class_of, errors, fork::Owner, seconds};
+use crate::{
+    endpoint::class_of,
+    errors,
+    fork::{Owner, may_guard},
+    seconds,
+};
 
 /// Maximum number of names of protected types in a process: each is kept until it ends.
 const NAMES_MAX: usize = 1_024;
@@ -98,6 +103,16 @@ pub(crate) fn check_callback(py: Python<'_>) -> PyResult<()> {
     }
     let text = "while a command or a safe function uses an output, its thread may call only trip and release of guards; call others afterwards";
     Err(errors::named(py, "BusyError", text))
+}
+
+/// Checks that this thread may make a guard.
+pub(crate) fn check_may_guard(py: Python<'_>) -> PyResult<()> {
+    check_callback(py)?;
+    if may_guard() {
+        return Ok(());
+    }
+    let text = "the process that this one was forked from has guards, and the thread that makes outputs safe is not in this one; start this program with subprocess, or with the method \"spawn\" of multiprocessing";
+    Err(errors::named(py, "ForkedError", text))
 }
 
 /// Returns the safe function of a guard: it calls Python, and has failed if that raises an exception.

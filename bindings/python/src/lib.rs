@@ -6,6 +6,7 @@
 //! | file | contents |
 //! | --- | --- |
 //! | `endpoint.rs` | an endpoint: each call begins one operation |
+//! | `lease.rs` | an endpoint that one operation has |
 //! | `registration.rs` | the registration of an endpoint |
 //! | `operation.rs` | an operation: a future that Python polls |
 //! | `parameters.rs` | parameters that the program serves |
@@ -23,6 +24,7 @@ mod endpoint;
 mod errors;
 mod fork;
 mod guard;
+mod lease;
 mod operation;
 mod parameters;
 mod received;

@@ -132,6 +132,10 @@ impl Operation {
     }
 
     fn drop_future(&self, py: Python<'_>) {
+        if self.owner.is_parent() {
+            // The drop of this object leaves the copy as it is.
+            return;
+        }
         let future = py.detach(|| self.future.lock().unwrap_or_else(PoisonError::into_inner).take());
         py.detach(|| drop(future));
     }
@@ -155,9 +159,13 @@ pub(crate) fn gone(py: Python<'_>) -> PyErr {
 
 impl Drop for Operation {
     fn drop(&mut self) {
-        // The end of a copy would withdraw the request of the parent.
+        let mut future = self.future.get_mut().unwrap_or_else(PoisonError::into_inner).take();
         if self.owner.is_parent() {
-            std::mem::forget(self.future.get_mut().unwrap_or_else(PoisonError::into_inner).take());
+            // The end of a copy would withdraw the request of the parent, and its wait in the memory of the ring.
+            std::mem::forget(future);
+        } else if future.is_some() {
+            // Without the GIL, as each end of an endpoint: an `unregister` has it.
+            let _ = Python::try_attach(|py| py.detach(|| drop(future.take())));
         }
     }
 }

@@ -62,7 +62,7 @@ impl Drop for Received {
     fn drop(&mut self) {
         // The parent settles it.
         if self.owner.is_parent() {
-            std::mem::forget(self.request());
+            std::mem::forget(self.message.get_mut().unwrap_or_else(PoisonError::into_inner).take());
         }
     }
 }

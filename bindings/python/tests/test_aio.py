@@ -12,7 +12,7 @@ from typing import Any, Awaitable, Callable, List
 import pytest
 
 import sinew
-from sinew import Outcome, _aio
+from sinew import Outcome, _aio, _wait
 
 LONG = 20.0
 
@@ -27,6 +27,18 @@ def run(main: Callable[[], Awaitable[Any]]) -> Any:
         return await asyncio.wait_for(main(), 60.0)
 
     return asyncio.run(limited(), debug=True)
+
+
+async def until_free(node: Any, name: str) -> sinew.AsyncEndpoint:
+    """Registers as soon as the name is free."""
+    until = time.monotonic() + LONG
+    while True:
+        try:
+            endpoint: sinew.AsyncEndpoint = await node.register(name)
+            return endpoint
+        except sinew.RefusedError:
+            assert time.monotonic() < until, "the name is still taken"
+            await asyncio.sleep(0.02)  # between two tries, until the deadline
 
 
 def test_messages_pass_between_tasks(node: Any) -> None:
@@ -101,6 +113,57 @@ def test_cancelled_receive_loses_no_message(node: Any) -> None:
     run(main)
 
 
+def test_message_of_a_cancelled_receive_is_for_the_next_one(node: Any) -> None:
+    async def main() -> None:
+        async with node.register() as one, node.register() as other:
+            first, second = asyncio.create_task(one.receive()), asyncio.create_task(one.receive())
+            while (waiter := one._receiving) is None:
+                await asyncio.sleep(0)
+            await other.send(one.tid, Count(1))
+            while not waiter.ended.done():
+                await asyncio.sleep(0)
+            first.cancel()  # it has the message, and has not run since
+            assert (await asyncio.wait_for(second, LONG)).value == Count(1)
+            assert first.cancelled()
+
+    run(main)
+
+
+def test_calls_that_need_not_wait_let_other_tasks_run(node: Any) -> None:
+    async def main() -> None:
+        async with node.register() as one:
+            turns = 0
+
+            async def turn() -> None:
+                nonlocal turns
+                while True:
+                    turns += 1
+                    await asyncio.sleep(0)
+
+            turning = asyncio.create_task(turn())
+            for number in range(8 * _aio.CALLS_MAX):
+                await one.send(one.tid, Count(number))
+            turning.cancel()
+            assert turns >= 7, "the sends have stopped the event loop"
+
+    run(main)
+
+
+def test_close_ends_a_call_that_waits(node: Any) -> None:
+    async def main() -> None:
+        for call in (lambda me: me.receive(), lambda me: me.ask(me.tid, Count(1), within=LONG)):
+            endpoint = await until_free(node, "drive")
+            waiting = asyncio.create_task(call(endpoint))
+            while endpoint._reader.waiter is None:
+                await asyncio.sleep(0)
+            endpoint.close()
+            with pytest.raises(sinew.ClosedError):
+                await waiting
+        await (await until_free(node, "drive")).unregister()
+
+    run(main)
+
+
 def test_receive_ends_at_its_deadline(node: Any) -> None:
     async def main() -> None:
         async with node.register() as one:
@@ -133,13 +196,13 @@ def test_cancelled_request_leaves_the_endpoint_usable(node: Any) -> None:
 
 def test_idle_endpoint_is_not_polled(node: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     steps: List[float] = []
-    step = _aio._Waiter._step
+    step = _wait.Waiter._step
 
     def counted(waiter: Any) -> None:
         steps.append(time.monotonic())
         step(waiter)
 
-    monkeypatch.setattr(_aio._Waiter, "_step", counted)
+    monkeypatch.setattr(_wait.Waiter, "_step", counted)
 
     async def main() -> None:
         async with node.register() as one:
@@ -188,14 +251,7 @@ def test_cancelled_registration_leaves_no_name(node: Any) -> None:
         registering.cancel()
         with pytest.raises(asyncio.CancelledError):
             await registering
-        until = time.monotonic() + LONG
-        while True:
-            try:
-                async with node.register("drive"):
-                    return
-            except sinew.RefusedError:
-                assert time.monotonic() < until, "the name is still taken"
-                await asyncio.sleep(0.02)
+        await (await until_free(node, "drive")).unregister()
 
     run(main)
 

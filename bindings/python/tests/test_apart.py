@@ -88,6 +88,13 @@ def test_socket_is_found_by_its_variable(node: Any, monkeypatch: pytest.MonkeyPa
         sinew.register()
 
 
+def test_first_program_of_the_readme_is_the_example() -> None:
+    folder = pathlib.Path(__file__).parents[1]
+    program = (folder / "examples" / "knee.py").read_text()
+    assert f"```python\n{program}```" in (folder / "README.md").read_text()
+    assert len(program.splitlines()) == 15, "the README counts them"
+
+
 def test_example_runs(node: Any) -> None:
     example = pathlib.Path(__file__).parents[1] / "examples" / "hello.py"
     environment = {**os.environ, "SINEW_SOCKET": node.socket}

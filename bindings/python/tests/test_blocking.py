@@ -247,13 +247,12 @@ def test_handlers_are_called_by_type(node: Any) -> None:
     with node.register("drive") as drive, node.register() as sender:
         drive.on(Torque, lambda message: Torque(message.value.newton_metres * 2))
         drive.on("test.text", lambda message: seen.append(message.value))
-        done = in_thread(lambda: drive.serve(2.0))
+        drive.serve(0.05)  # ends by itself
+        done = in_thread(lambda: drive.serve(LONG))
         assert sender.ask("drive", Torque(2.0), within=LONG).value == Torque(4.0)
         assert sender.send_confirmed("drive", "test.text", "hello", within=LONG) is Outcome.DELIVERED
         assert sender.send_confirmed("drive", Angle(1.0), class_="control", within=LONG) is Outcome.REJECTED_UNKNOWN_KIND
-        done()
         drive.on("test.text", lambda _: 1 / 0)
-        done = in_thread(lambda: drive.serve(LONG))
         assert sender.send_confirmed("drive", "test.text", "hello", within=LONG) is Outcome.FAILED
         with pytest.raises(ZeroDivisionError):
             done()
@@ -282,6 +281,8 @@ def test_second_thread_on_an_endpoint_is_refused(node: Any) -> None:
                 one.resolve("x")
             except sinew.BusyError:
                 break
+        with pytest.raises(sinew.BusyError):
+            one.close()
         other.send(one.tid, Torque(1.0))
         assert done() is not None
 
@@ -349,6 +350,8 @@ def test_endpoint_continues_after_a_restart_of_its_node(node: Any) -> None:
             assert other.resolve("drive") == drive.tid
             other.send(sinew.group("drives"), Torque(4.0))
             assert received(drive).value == Torque(4.0)
+        node.stop(signal.SIGKILL)
+        drive.serve(0.2)  # waits for the node, without an error
 
 
 def test_socket_without_rings_is_the_same(node: Any) -> None:

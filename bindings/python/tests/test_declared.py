@@ -92,6 +92,13 @@ def test_class_with_an_open_annotation_has_none() -> None:
     assert structure_of(Anything) is None
 
 
+@pytest.mark.parametrize("hint", [Annotated[Optional[float], sinew.F32], Annotated[float, sinew.U8], Annotated[int, sinew.F32]])
+def test_width_of_another_type_is_refused(hint: Any) -> None:
+    wrong = dataclasses.make_dataclass("Wrong", [("value", hint)])
+    with pytest.raises(TypeError, match="no width of"):
+        structure_of(wrong)
+
+
 @pytest.mark.parametrize("shape", [("word",), ("list", ("list",)), ("named", "absent"), ()])
 def test_structure_without_a_form_is_refused(shape: Any) -> None:
     with pytest.raises((ValueError, IndexError)):

@@ -284,6 +284,28 @@ def test_end_of_copies_in_a_forked_child_has_no_effect(node: Any) -> None:
         other.close()
 
 
+@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
+def test_end_of_a_waiting_call_in_a_forked_child_leaves_that_of_the_parent(node: Any) -> None:
+    async def main() -> Any:
+        async with node.register() as one, node.register() as other:
+            asking = asyncio.create_task(one.ask(other.tid, Number(1), within=LONG))
+            request = await other.receive()
+            child = os.fork()
+            if child == 0:
+                waiter = one._reader.waiter
+                if waiter is not None:
+                    # As the end of its event loop does.
+                    waiter._operation.cancel()
+                    os._exit(42)
+                os._exit(1)
+            _, status = os.waitpid(child, 0)
+            assert os.waitstatus_to_exitcode(status) == 42
+            await other.reply(request, Number(2))
+            return (await asyncio.wait_for(asking, LONG / 2)).value
+
+    assert asyncio.run(main()) == Number(2)
+
+
 def test_direct_link_carries_all_that_a_node_carries(node: Any) -> None:
     with node.register("one", direct="always") as one, node.register("other", direct="always") as other:
         for turn in range(2_000):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import threading
 import time
 from typing import Any, List
@@ -163,6 +164,25 @@ def test_guard_works_from_asyncio(node: Any) -> None:
             await asyncio.gather(*listening, return_exceptions=True)
 
     asyncio.run(main())
+
+
+@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
+def test_child_of_a_process_with_guards_cannot_guard(node: Any) -> None:
+    """The thread that makes outputs safe is not in the child."""
+    with node.register() as one:
+        guard = one.guard(one.tid, TORQUE, lambda _: None)
+        child = os.fork()
+        if child == 0:
+            try:
+                own = node.register().open()
+                own.guard(own.tid, TORQUE, lambda _: None)
+            except sinew.ForkedError:
+                os._exit(42)
+            finally:
+                os._exit(1)
+        _, status = os.waitpid(child, 0)
+        assert os.waitstatus_to_exitcode(status) == 42
+        assert not guard.is_live
 
 
 def test_limits_that_nothing_can_keep_are_refused(node: Any) -> None:

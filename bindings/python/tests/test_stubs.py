@@ -37,7 +37,7 @@ def test_package_has_types(tmp_path: pathlib.Path) -> None:
     assert (pathlib.Path(sinew.__file__).parent / "py.typed").exists()
     program = tmp_path / "program.py"
     program.write_text(PROGRAM)
-    command = [sys.executable, "-m", "mypy", "--strict", "--cache-dir", str(tmp_path), str(program)]
+    command = [sys.executable, "-m", "mypy", "--strict", str(program)]
     checked = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
     lines = [line for line in checked.stdout.splitlines() if "error" in line]
     assert len(lines) == 2 and 'to "Angle" has incompatible type' in lines[0], checked.stdout + checked.stderr

@@ -75,6 +75,17 @@ def test_value_that_contains_itself_is_refused() -> None:
         _sinew.encode(endless)
 
 
+def test_list_that_changes_while_it_is_written_is_refused() -> None:
+    class Grows:
+        def tolist(self) -> int:
+            values.append(1)
+            return 0
+
+    values: List[Any] = [Grows(), 2]
+    with pytest.raises(ValueError, match="changed its length"):
+        _sinew.encode(values)
+
+
 def test_value_without_a_form_is_refused() -> None:
     with pytest.raises(TypeError, match="cannot hold a object"):
         _sinew.encode({"a": object()})

@@ -8,6 +8,7 @@ use std::{
     io,
     os::unix::net::UnixStream,
     panic::{AssertUnwindSafe, catch_unwind},
+    process,
     sync::{
         Arc, Mutex, OnceLock, PoisonError,
         mpsc::{Receiver, SyncSender, TrySendError, sync_channel},
@@ -37,8 +38,8 @@ const TASKS_MAX: usize = 256;
 static PROCESS: LinkMaker = LinkMaker { tasks: OnceLock::new() };
 
 struct LinkMaker {
-    /// `None` if its thread could not be started.
-    tasks: OnceLock<Option<SyncSender<Job>>>,
+    /// The id of the process with the thread, and the thread's queue; `None` if it could not be started.
+    tasks: OnceLock<(u32, Option<SyncSender<Job>>)>,
 }
 
 /// One step of the setup of a link.
@@ -100,7 +101,7 @@ struct PeerHalf {
 }
 
 impl LinkTasks {
-    /// Submits a task. If too many wait, or if the thread could not be started, returns it.
+    /// Submits a task. If too many wait, or if this process has no such thread, returns it.
     pub(super) fn submit(
         &mut self,
         number: LinkNumber,
@@ -176,15 +177,18 @@ impl LinkMaker {
         let start = || {
             let (sender, jobs) = sync_channel(TASKS_MAX);
             let thread = thread::Builder::new().name("sinew-links".to_owned());
-            match thread.spawn(move || run(&jobs)) {
+            let tasks = match thread.spawn(move || run(&jobs)) {
                 Ok(_) => Some(sender),
                 Err(why) => {
                     sinew_runtime::log::here!(warn: %why, "no thread for the memory of direct links: messages go through the node");
                     None
                 }
-            }
+            };
+            (process::id(), tasks)
         };
-        self.tasks.get_or_init(start).as_ref()
+        let (owner, tasks) = self.tasks.get_or_init(start);
+        // The child of a fork has a copy of the queue, and no thread.
+        tasks.as_ref().filter(|_| *owner == process::id())
     }
 }
 

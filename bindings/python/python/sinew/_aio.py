@@ -1,8 +1,4 @@
-"""The endpoint for asyncio.
-
-The extension module has one descriptor for each endpoint. While an operation waits, the event loop watches it with
-`add_reader`, and a timer stands for its next deadline. Nothing else runs: no thread, and no other event loop.
-"""
+"""The endpoint for asyncio."""
 
 from __future__ import annotations
 
@@ -11,7 +7,6 @@ import inspect
 from collections import deque
 from types import TracebackType
 from typing import (
-    TYPE_CHECKING,
     Any,
     AsyncIterator,
     Awaitable,
@@ -21,7 +16,6 @@ from typing import (
     List,
     Mapping,
     Optional,
-    Tuple,
     Type,
     Union,
     overload,
@@ -34,130 +28,18 @@ from ._plans import _NOTHING, LEAD, WITHIN, Destination, Options, Plan, Plans, S
 from ._protection import Guard, Protected, make_guard
 from ._reports import Applied, ParameterList, StopReport, TransactionReport, Undelivered
 from ._values import MemberOutcome, MessageClass, Outcome, Tid
+from ._wait import Done, Reader, Waiter, drive
 from .errors import ClosedError, DisconnectedError
-
-if TYPE_CHECKING:
-    _Done = Optional[Tuple[Any]]
 
 __all__ = ["AsyncEndpoint"]
 
-
-class _Reader:
-    """Watches the descriptor and the deadlines of an endpoint for the operation that waits.
-
-    Waits that follow each other at once have one reader in the event loop, and one timer. Both are gone in the next turn
-    of the event loop without a wait.
-    """
-
-    def __init__(self) -> None:
-        self._loop: Optional[asyncio.AbstractEventLoop] = None
-        """The event loop that has the reader now."""
-        self._operation: Optional[_sinew.Operation] = None
-        """Keeps the descriptor open as long as the reader is there. All operations of an endpoint have the same one."""
-        self._step: Optional[Callable[[], None]] = None
-        self._timer: Optional[asyncio.TimerHandle] = None
-
-    def begin(self, operation: _sinew.Operation, step: Callable[[], None]) -> None:
-        """Calls `step` after each event, and at the operation's deadline."""
-        loop = asyncio.get_running_loop()
-        if self._loop is not loop:
-            loop.add_reader(operation.fileno(), self._on_event)
-            self._loop, self._timer = loop, None
-        self._operation, self._step = operation, step
-        self.set_timer()
-
-    def set_timer(self) -> None:
-        """Follows the deadline of the operation. A timer that ends earlier stays: it causes one needless poll."""
-        if self._loop is None or self._operation is None:
-            return
-        left = self._operation.wake_in()
-        if left is None:
-            return
-        at = self._loop.time() + left
-        if self._timer is not None:
-            if self._timer.when() <= at:
-                return
-            self._timer.cancel()
-        self._timer = self._loop.call_at(at, self._on_timer)
-
-    def end(self) -> None:
-        """Ends the wait."""
-        self._step = None
-        if self._loop is not None and not self._loop.is_closed():
-            self._loop.call_soon(self.remove_if_idle)
-
-    def _on_event(self) -> None:
-        if self._step is not None:
-            self._step()
-
-    def _on_timer(self) -> None:
-        self._timer = None
-        self._on_event()
-
-    def remove_if_idle(self) -> None:
-        """Removes the reader, unless an operation waits."""
-        if self._step is not None or self._loop is None or self._operation is None:
-            return
-        if not self._loop.is_closed():
-            self._loop.remove_reader(self._operation.fileno())
-        if self._timer is not None:
-            self._timer.cancel()
-        self._loop = self._operation = self._timer = None
-
-
-class _Waiter:
-    """One operation that waits for its descriptor or its deadline, in the running event loop."""
-
-    def __init__(self, operation: _sinew.Operation, reader: _Reader) -> None:
-        self._loop = asyncio.get_running_loop()
-        self._operation = operation
-        self._reader = reader
-        self.ended: asyncio.Future[_Done] = self._loop.create_future()
-
-    async def wait(self, deadline: Optional[float] = None) -> _Done:
-        """Returns the result in a tuple; `None` at the deadline, or after `stop`."""
-        limit = None if deadline is None else self._loop.call_at(deadline, self.stop)
-        self._reader.begin(self._operation, self._step)
-        try:
-            return await self.ended
-        finally:
-            self._reader.end()
-            if limit is not None:
-                limit.cancel()
-
-    def stop(self) -> None:
-        """Ends the wait without a result."""
-        if not self.ended.done():
-            self.ended.set_result(None)
-
-    def _step(self) -> None:
-        if self.ended.done():
-            return
-        try:
-            done = self._operation.poll()
-        except BaseException as error:  # it belongs to the task that waits
-            self.ended.set_exception(error)
-            return
-        if done is None:
-            self._reader.set_timer()
-        else:
-            self.ended.set_result(done)
-
-
-async def drive(operation: _sinew.Operation, reader: _Reader) -> Any:
-    """Runs an operation to its end. Cancelling the task cancels it."""
-    done = operation.poll()
-    if done is None:
-        try:
-            done = await _Waiter(operation, reader).wait()
-        finally:
-            operation.cancel()
-    return None if done is None else done[0]
+CALLS_MAX = 32
+"""Calls of an endpoint after which other tasks run, even if none of the calls has to wait."""
 
 
 async def begin(registration: _sinew.Operation) -> AsyncEndpoint:
     """Runs a registration to its end."""
-    reader = _Reader()
+    reader = Reader()
     try:
         core = await drive(registration, reader)
     finally:
@@ -187,13 +69,21 @@ class AsyncEndpoint:
         self._lock = asyncio.Lock()
         self._waiting = 0
         """Calls that wait for the end of a `receive`."""
-        self._reader = _Reader()
-        self._receiving: Optional[_Waiter] = None
+        self._reader = Reader()
+        self._receiving: Optional[Waiter] = None
         self._kept: Deque[Message] = deque()
         """Messages that arrived in the moment in which their `receive` was cancelled."""
+        self._calls = 0
+
+    async def _let_others_run(self) -> None:
+        """A flood of messages would otherwise keep the timers and the other tasks of the event loop from running."""
+        self._calls += 1
+        if self._calls % CALLS_MAX == 0:
+            await asyncio.sleep(0)
 
     async def _operate(self, start: Start) -> Any:
         """Runs one operation, when no other one runs."""
+        await self._let_others_run()
         self._waiting += 1
         if self._receiving is not None:
             self._receiving.stop()
@@ -295,14 +185,17 @@ class AsyncEndpoint:
         """Waits for a message, at most `within` seconds; `None` if none arrived.
 
         Control messages are first, then Stream, of which only the newest value of each source and type is kept, then Bulk.
-        Raises `DisconnectedError` once when the node has gone; later calls wait for its return.
+        Raises `DisconnectedError` once when the node has gone; later calls wait for its return. While another task is in
+        `receive`, this one waits for its end, also beyond `within`.
         """
         loop = asyncio.get_running_loop()
         deadline = None if within is None else loop.time() + within
+        await self._let_others_run()
         while True:
-            if self._kept:
-                return self._kept.popleft()
             async with self._lock:
+                # Here: the `receive` that kept one had the lock.
+                if self._kept:
+                    return self._kept.popleft()
                 if not self._waiting:
                     done = await self._receive(deadline)
                     if done is not None:
@@ -310,12 +203,12 @@ class AsyncEndpoint:
             if deadline is not None and loop.time() >= deadline:
                 return None
 
-    async def _receive(self, deadline: Optional[float]) -> _Done:
+    async def _receive(self, deadline: Optional[float]) -> Done:
         operation = self._core.receive()
         done = operation.poll()
         if done is not None:
             return done
-        waiter = self._receiving = _Waiter(operation, self._reader)
+        waiter = self._receiving = Waiter(operation, self._reader)
         try:
             return await waiter.wait(deadline)
         except asyncio.CancelledError:
@@ -483,7 +376,9 @@ class AsyncEndpoint:
         await self._run(self._plans.unregister())
 
     def close(self) -> None:
-        """Releases the address at once."""
+        """Releases the address at once. A call that waits on this endpoint raises `ClosedError`."""
+        if self._reader.waiter is not None:
+            self._reader.waiter.close()
         self._core.close()
 
     async def __aenter__(self) -> AsyncEndpoint:

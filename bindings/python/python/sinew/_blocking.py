@@ -169,7 +169,12 @@ class Endpoint:
             return
         until = _sinew.now() + within
         while _sinew.now() < until:
-            message = self.receive(max(0.0, until - _sinew.now()))
+            try:
+                message = self.receive(max(0.0, until - _sinew.now()))
+            except DisconnectedError:
+                continue  # the next call waits for the node
+            except ClosedError:
+                return
             if message is not None:
                 yield message
 
@@ -272,7 +277,8 @@ class Endpoint:
         """Guards an output: it is live only while good messages of this type arrive from `source`.
 
         `safe` is called with the cause, on another thread, and makes the output safe. From now on `receive` returns only
-        good messages of this type from this sender, while the output is live.
+        good messages of this type from this sender, while the output is live. With `direct="always"` the stop of the
+        whole system does not reach the output. Raises `ForkedError` in the child of a process that has guards.
         """
         return make_guard(self._core, source, protected, safe)
 
@@ -291,7 +297,7 @@ class Endpoint:
         self._run(self._plans.unregister())
 
     def close(self) -> None:
-        """Releases the address at once."""
+        """Releases the address at once. Raises `BusyError` while another thread is in a call on this endpoint."""
         self._core.close()
 
     def __enter__(self) -> Endpoint:

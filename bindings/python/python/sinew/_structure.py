@@ -52,7 +52,10 @@ class _Unknown(Exception):
 
 
 def structure_of(cls: type) -> Optional[bytes]:
-    """Returns the canonical bytes of the structure of a payload class; `None` if an annotation does not say it."""
+    """Returns the canonical bytes of the structure of a payload class; `None` if an annotation does not say it.
+
+    Raises `TypeError` for a width that is not of its type: messages would differ from the structure.
+    """
     given = cls.__dict__.get("__sinew_structure__")
     if given is not None:
         return typing.cast(bytes, given)
@@ -89,8 +92,12 @@ class _Maker:
 
     def shape(self, hint: Any) -> Shape:
         if typing.get_origin(hint) is Annotated:
+            inner = typing.get_args(hint)[0]
             exact = [each.word for each in hint.__metadata__ if isinstance(each, Width)]
-            return (exact[0],) if exact else self.shape(typing.get_args(hint)[0])
+            if exact and inner is not (float if exact[0] == "f32" else int):
+                text = f"{exact[0]} is no width of {inner}: write Annotated[float, sinew.F32] or Annotated[int, sinew.U8]"
+                raise TypeError(f"{text}, inside of Optional and List")
+            return (exact[0],) if exact else self.shape(inner)
         if hint in _LEAVES:
             return (_LEAVES[hint],)
         if isinstance(hint, type) and dataclasses.is_dataclass(hint):
