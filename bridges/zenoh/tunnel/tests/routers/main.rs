@@ -8,7 +8,10 @@
 //!
 //! `SINEW_PROGRAMS` names another folder with the program `scenarios`. `SINEW_FAULTS=160 SINEW_RATE=2500` runs
 //! the long form of `history`: 100,000 confirmed messages, a fault each 5 s.
+//!
+//! `SINEW_HOSTS=30 .. --test routers -- --ignored --nocapture` prints the cost of a host among 30.
 
+mod cost;
 mod history;
 mod losses;
 mod site;

@@ -22,7 +22,7 @@ pub(crate) struct Site {
 }
 
 /// The folder of the main workspace's programs.
-fn scenarios() -> Option<PathBuf> {
+pub(crate) fn scenarios() -> Option<PathBuf> {
     let default = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../target/debug");
     let folder = std::env::var_os("SINEW_PROGRAMS").map_or(default, PathBuf::from);
     let path = folder.join("scenarios");
@@ -56,31 +56,14 @@ impl Site {
     }
 
     pub(crate) fn router(&self, host: usize) -> NodeProcess {
-        let mut command = self.hosts.all()[host].command(Path::new(env!("CARGO_BIN_EXE_sinew-zenoh-router")));
-        command.args([LEASE_MS, "tcp/0.0.0.0:7447"]);
         // Each reaches the other in all networks; one is enough.
         let other = ROUTERS.iter().find(|other| **other != host).expect("two routers");
-        command.arg(format!("tcp/10.77.0.{}:7447", other + 1));
-        let mut router = NodeProcess::start("router", command);
-        router.wait_for(&["router"]);
-        router
+        router(&self.hosts.all()[host], Some(&format!("tcp/10.77.0.{}:7447", other + 1)))
     }
 
     pub(crate) fn tunnel(&self, host: usize, key: Option<&str>) -> NodeProcess {
-        let key = key.map_or_else(
-            || "false".to_owned(),
-            |key| format!("\"{}\"", self.directory.write("discovery.key", key).display()),
-        );
-        let [first, second] = ROUTERS.map(|router| format!("tcp/10.{}.0.{}:7447", 77 + host, router + 1));
-        let text = format!(
-            "project = \"hosts\"\naddress = \"10.99.0.{}/16\"\nports = [6911, 6912]\nkey = {key}\n\
-             routers = [\"{first}\", \"{second}\"]\nlease_ms = {LEASE_MS}\n",
-            host + 1
-        );
-        let path = self.directory.write(&format!("link-{host}.toml"), &text);
-        let mut command = self.hosts.all()[host].command(Path::new(env!("CARGO_BIN_EXE_sinew-zenoh")));
-        command.arg(path);
-        NodeProcess::start("sinew-zenoh", command)
+        let routers = ROUTERS.map(|router| format!("tcp/10.{}.0.{}:7447", 77 + host, router + 1));
+        tunnel((&self.hosts.all()[host], host), &self.directory, key, &routers)
     }
 
     /// Starts a node of the scenarios on a host, in this role, with these arguments behind its configuration.
@@ -91,17 +74,10 @@ impl Site {
         arguments: &[&str],
         take: impl FnMut(&str) -> bool + Send + 'static,
     ) -> NodeProcess {
-        let (name, address) = (NAMES[host], host + 1);
-        let text = format!(
-            "[node]\nname = \"{name}\"\nproject = \"hosts\"\naddress = \"10.99.0.{address}\"\n\
-             mailbox_capacity = 65536\n\
-             [gncl]\nport = 6912\nqueue_capacity = 65536\n\
-             [ndl]\ninterface = \"zenoh\"\nport = 6911\nmdns_port = false\nperiod_ms = {PERIOD_MS}\n"
-        );
-        let path = self.directory.write(&format!("{name}.toml"), &text);
+        let config = configuration(&self.directory, NAMES[host], host);
         let mut command = self.hosts.all()[host].command(&self.scenarios);
-        command.args(["--role", role]).arg(path).args(arguments);
-        NodeProcess::start_with(name, command, take)
+        command.args(["--role", role]).arg(config).args(arguments);
+        NodeProcess::start_with(NAMES[host], command, take)
     }
 
     /// Starts the node under test on a host.
@@ -116,8 +92,51 @@ impl Site {
     }
 }
 
+/// Starts a router on a host, connected with another one.
+pub(crate) fn router(host: &Host, other: Option<&str>) -> NodeProcess {
+    let mut command = host.command(Path::new(env!("CARGO_BIN_EXE_sinew-zenoh-router")));
+    command.args([LEASE_MS, "tcp/0.0.0.0:7447"]).args(other);
+    let mut router = NodeProcess::start("router", command);
+    router.wait_for(&["router"]);
+    router
+}
+
+/// Starts the tunnel of the host with this index, which uses one of these routers.
+pub(crate) fn tunnel(
+    (host, index): (&Host, usize),
+    directory: &TestDirectory,
+    key: Option<&str>,
+    routers: &[String],
+) -> NodeProcess {
+    let key = key.map_or_else(
+        || "false".to_owned(),
+        |key| format!("\"{}\"", directory.write("discovery.key", key).display()),
+    );
+    let text = format!(
+        "project = \"hosts\"\naddress = \"10.99.0.{}/16\"\nports = [6911, 6912]\nkey = {key}\n\
+         routers = [\"{}\"]\nlease_ms = {LEASE_MS}\n",
+        index + 1,
+        routers.join("\", \"")
+    );
+    let mut command = host.command(Path::new(env!("CARGO_BIN_EXE_sinew-zenoh")));
+    command.arg(directory.write(&format!("link-{index}.toml"), &text));
+    NodeProcess::start("sinew-zenoh", command)
+}
+
+/// Writes the configuration of a node on the host with this index.
+pub(crate) fn configuration(directory: &TestDirectory, name: &str, index: usize) -> PathBuf {
+    let address = index + 1;
+    let text = format!(
+        "[node]\nname = \"{name}\"\nproject = \"hosts\"\naddress = \"10.99.0.{address}\"\n\
+         mailbox_capacity = 65536\n\
+         [gncl]\nport = 6912\nqueue_capacity = 65536\n\
+         [ndl]\ninterface = \"zenoh\"\nport = 6911\nmdns_port = false\nperiod_ms = {PERIOD_MS}\n"
+    );
+    directory.write(&format!("{name}.toml"), &text)
+}
+
 /// Makes the device of a host, as its administrator does once.
-fn device(host: &Host, index: usize) -> Result<(), String> {
+pub(crate) fn device(host: &Host, index: usize) -> Result<(), String> {
     host.ip("tuntap add dev zenoh mode tun")?;
     host.ip(&format!("address add 10.99.0.{}/16 dev zenoh", index + 1))?;
     host.ip("link set zenoh mtu 4096 up")
