@@ -29,6 +29,20 @@ pub enum DropCause {
     TooManyHosts,
 }
 
+impl DropCause {
+    /// Returns whether it occurs in normal operation: the kernel and other programs send such packets to every
+    /// interface, and discovery repeats its own.
+    #[must_use]
+    pub const fn is_expected(self) -> bool {
+        matches!(
+            self,
+            Self::Packet(PacketError::NotIpv4 | PacketError::OtherProtocol)
+                | Self::OutsideTarget
+                | Self::GroupPace
+        )
+    }
+}
+
 impl fmt::Display for DropCause {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {

@@ -241,12 +241,12 @@ impl Shared {
         Ok(key)
     }
 
-    /// Logs each cause of drops that occurred since the last report. Returns the present counters.
+    /// Logs each unexpected cause of drops that occurred since the last report. Returns the present counters.
     fn report(&self, before: Counts) -> Counts {
         let counts = lock(&self.link).counts().clone();
         for (cause, count) in &counts.dropped {
             let new = count - before.dropped_for(*cause);
-            if new > 0 {
+            if new > 0 && !cause.is_expected() {
                 warn!("dropped {new}: {cause}");
             }
         }

@@ -113,6 +113,7 @@ fn group_query_goes_to_all_at_its_pace() {
     assert_eq!(read(&mut a, NOW + Duration::from_millis(500), query), []);
     assert_eq!(read(&mut a, NOW + Duration::from_secs(1), query).len(), 1);
     assert_eq!(a.counts().dropped_for(DropCause::GroupPace), 1);
+    assert!(a.counts().dropped.keys().all(|cause| cause.is_expected()));
 }
 
 // spec: ZLINK-3.1
