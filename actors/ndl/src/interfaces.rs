@@ -57,6 +57,8 @@ pub(super) struct Usable {
     pub(super) numbers: BTreeMap<String, u32>,
     /// All addresses of this host, used or not, except those in doubt.
     pub(super) own: Vec<SocketAddr>,
+    /// The interface name of each of these addresses.
+    pub(super) names: BTreeMap<SocketAddr, String>,
     /// Whether any interface has an IPv6 address, including loopback.
     pub(super) has_ipv6: bool,
     /// Whether a read has succeeded.
@@ -70,8 +72,11 @@ impl Usable {
         let numbers = all.iter().filter(|local| local.address.interface != 0);
         let numbers = numbers.map(|local| (local.name.clone(), local.address.interface)).collect();
         let has_ipv6 = all.iter().any(|local| local.address.ip.is_ipv6());
-        let own = all.iter().filter(|local| !local.is_in_doubt()).map(|local| local.address.at(0)).collect();
-        let mut usable = Self { numbers, own, has_ipv6, is_known: true, ..Self::default() };
+        let named = all.iter().filter(|local| !local.is_in_doubt());
+        let named: Vec<_> = named.map(|local| (local.address.at(0), local.name.clone())).collect();
+        let own = named.iter().map(|(address, _)| *address).collect();
+        let names = named.into_iter().collect();
+        let mut usable = Self { numbers, own, names, has_ipv6, is_known: true, ..Self::default() };
         // If there is no room for all, no IPv6 address of one choice takes the only path of another. The IPv4
         // addresses and the first IPv6 address of each choice come first, then the others in turn.
         let turn = |(nth, local): (usize, &'_ Local)| if local.address.ip.is_ipv4() { 0 } else { nth };

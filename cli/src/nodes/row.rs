@@ -167,15 +167,30 @@ fn link_json(link: &LinkReport) -> Value {
     json!({ "class": class, "up": is_up, "waiting": waiting, "unconfirmed": unconfirmed })
 }
 
-/// Returns on how many routes NDL queries it, and how many of them answer, if not all do.
+/// Returns on how many routes NDL queries it, and how many of them answer, if not all do. The interfaces of
+/// these follow, that of the route in use first.
 fn routes(seen: &PeerReport) -> String {
-    let (all, answer) = (seen.routes.len(), seen.routes.iter().filter(|route| route.missed == 0).count());
-    if all == answer { all.to_string() } else { format!("{answer} of {all}") }
+    let answering: Vec<_> = seen.routes.iter().filter(|route| route.missed == 0).collect();
+    let (all, answer) = (seen.routes.len(), answering.len());
+    let count = if all == answer { all.to_string() } else { format!("{answer} of {all}") };
+    let mut names: Vec<&str> = Vec::new();
+    for name in answering.iter().filter_map(|route| route.interface.as_deref()) {
+        if !names.contains(&name) {
+            names.push(name);
+        }
+    }
+    if names.is_empty() { count } else { format!("{count} ({})", names.join(", ")) }
 }
 
 fn route_json(of: &RouteReport) -> Value {
-    let RouteReport { here, there, missed, round_trip_ns } = of;
-    json!({ "here": here, "there": there, "missed": missed, "round_trip_ns": round_trip_ns })
+    let RouteReport { here, interface, there, missed, round_trip_ns } = of;
+    json!({
+        "here": here,
+        "interface": interface,
+        "there": there,
+        "missed": missed,
+        "round_trip_ns": round_trip_ns,
+    })
 }
 
 fn trouble_json(of: &TroubleReport) -> Value {
@@ -205,9 +220,10 @@ mod tests {
     use super::*;
 
     #[test]
-    fn answering_routes_are_counted_if_not_all_answer() {
+    fn answering_routes_are_counted_and_their_interfaces_named() {
         let route = |missed| RouteReport {
             here: "10.0.0.1:1".to_owned(),
+            interface: None,
             there: "10.0.0.7:1".to_owned(),
             missed,
             round_trip_ns: None,
@@ -217,6 +233,9 @@ mod tests {
             routes_of(routes)
         };
         assert_eq!([of(&[]), of(&[0]), of(&[0, 0]), of(&[0, 3])], ["0", "1", "2", "1 of 2"]);
+        let by = |name: &str, missed| RouteReport { interface: Some(name.to_owned()), ..route(missed) };
+        assert_eq!(routes_of(vec![by("zenoh", 0), by("eth0", 3)]), "1 of 2 (zenoh)");
+        assert_eq!(routes_of(vec![by("eth0", 0), by("eth0", 0), by("zenoh", 0)]), "3 (eth0, zenoh)");
     }
 
     fn routes_of(routes: Vec<RouteReport>) -> String {

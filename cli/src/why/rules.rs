@@ -188,7 +188,10 @@ impl Steps {
         let (Some(report), Some(node)) = (&from.report, to.node) else { return };
         let what = format!("{} knows {}", from.label(), to.label());
         if let Some(peer) = from.peer(node).filter(|peer| peer.is_there) {
-            let detail = last_received(peer);
+            let mut detail = last_received(peer);
+            if let Some(name) = peer.routes.first().and_then(|route| route.interface.as_deref()) {
+                detail += &format!(", over {name}");
+            }
             if to.report.is_none()
                 && let Some((cause, fix)) = silent::cause(peer)
             {

@@ -361,6 +361,7 @@ impl Shell {
             || self.feed(|core, now| {
                 if usable.is_known {
                     core.use_local_addresses(&usable.own);
+                    core.use_interface_names(usable.names.clone());
                 }
                 core.announce_gncl(super::announcing::announced(state, &here));
                 core.use_seeds(now, seeds);

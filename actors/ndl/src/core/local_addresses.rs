@@ -3,7 +3,10 @@
 //! An address that another host announces may lead to this host instead. A container's bridge has the same
 //! address on each host that has one. It is announced if `ndl.interface` is `all`.
 
-use std::{collections::BTreeSet, net::SocketAddr};
+use std::{
+    collections::{BTreeMap, BTreeSet},
+    net::SocketAddr,
+};
 
 use sinew_model::{
     address::{host_at, seen_from},
@@ -19,6 +22,8 @@ pub(super) struct LocalAddresses {
     paths: Vec<SocketAddr>,
     /// All addresses of this host, as far as the interfaces are watched.
     all: BTreeSet<SocketAddr>,
+    /// The interface name of each of them, for tools.
+    names: BTreeMap<SocketAddr, String>,
     /// A path was removed after another one was added. A node that left meanwhile knows this node at the removed one.
     has_moved: bool,
     seeds: Vec<SocketAddr>,
@@ -57,6 +62,16 @@ impl LocalAddresses {
     /// Sets all addresses of this host, used or not.
     pub(super) fn use_all(&mut self, all: &[SocketAddr]) {
         self.all = hosts(all);
+    }
+
+    /// Sets the interface names of the addresses of this host.
+    pub(super) fn use_names(&mut self, names: BTreeMap<SocketAddr, String>) {
+        self.names = names;
+    }
+
+    /// Returns the interface name of a local address, if the interfaces are watched.
+    pub(super) fn interface_of(&self, path: SocketAddr) -> Option<&str> {
+        self.names.get(&host_at(path)).map(String::as_str)
     }
 
     /// Returns whether exactly these addresses are known as this host's.

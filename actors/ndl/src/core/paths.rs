@@ -1,6 +1,6 @@
 //! The use of local addresses: which places are queried when one is added or removed.
 
-use std::net::SocketAddr;
+use std::{collections::BTreeMap, net::SocketAddr};
 
 use sinew_runtime::{tid::NodeAddress, time::Time};
 
@@ -44,6 +44,11 @@ impl Core {
     /// Sets the addresses of this host, used or not.
     pub fn use_local_addresses(&mut self, all: &[SocketAddr]) {
         self.local_addresses.use_all(all);
+    }
+
+    /// Sets the interface name of each of these addresses. It decides nothing.
+    pub fn use_interface_names(&mut self, names: BTreeMap<SocketAddr, String>) {
+        self.local_addresses.use_names(names);
     }
 
     /// Returns whether exactly these addresses are known as this host's.

@@ -13,8 +13,8 @@ use sinew_runtime::{
 };
 
 use super::{
-    Core, LostNode, Member, Neighbour, OwnStalls, Place, RememberedPeer, Source, remembered::Present,
-    routes::Route,
+    Core, LostNode, Member, Neighbour, OwnStalls, Place, RememberedPeer, Source,
+    local_addresses::LocalAddresses, remembered::Present, routes::Route,
 };
 
 /// A node that is present.
@@ -93,6 +93,9 @@ pub struct KnownNode {
 pub struct KnownRoute {
     /// Local address.
     pub here: SocketAddr,
+    /// Name of the interface with the local address. `None` if `ndl.interface` names addresses alone: the
+    /// interfaces are not watched then.
+    pub interface: Option<String>,
     /// Remote address.
     pub there: SocketAddr,
     /// Number of consecutive rounds of queries that were not answered there.
@@ -102,9 +105,9 @@ pub struct KnownRoute {
 }
 
 impl KnownRoute {
-    const fn of(route: &Route) -> Self {
+    fn of(route: &Route, local: &LocalAddresses) -> Self {
         let Route { place: Place { here, there }, missed, round_trip, .. } = *route;
-        Self { here, there, missed, round_trip }
+        Self { here, interface: local.interface_of(here).map(str::to_owned), there, missed, round_trip }
     }
 }
 
@@ -161,7 +164,7 @@ impl Core {
             name: member.announcement.name.clone(),
             incarnation: member.announcement.incarnation,
             udp: member.routes.best().there,
-            routes: member.routes.iter().map(KnownRoute::of).collect(),
+            routes: member.routes.iter().map(|route| KnownRoute::of(route, &self.local_addresses)).collect(),
             gncl: member.gncl_addresses(&self.local_addresses),
             period: Duration::from_micros(member.announcement.period_us.into()),
             since: member.since,

@@ -54,9 +54,11 @@ fn all_verified_own_addresses_are_known_for_any_choice() {
         local6("eth0", "fe80::1", 2),
         Local { flags: asked, ..local6("eth0", "fd00::1", 2) },
     ];
-    let own = Usable::of(&chosen(&["eth0/ipv4"]), &all).own;
+    let Usable { own, names, .. } = Usable::of(&chosen(&["eth0/ipv4"]), &all);
     let words: Vec<_> = own.iter().map(ToString::to_string).collect();
     assert_eq!(words, ["127.0.0.1:0", "10.0.0.1:0", "172.17.0.1:0", "[fe80::1%2]:0"]);
+    let names: Vec<_> = own.iter().map(|address| &*names[address]).collect();
+    assert_eq!(names, ["lo", "eth0", "docker0", "eth0"]);
 }
 
 #[test]

@@ -61,9 +61,10 @@ fn peer_report(known: &KnownNode, now: Time) -> PeerReport {
 }
 
 fn route(of: &KnownRoute) -> RouteReport {
-    let KnownRoute { here, there, missed, round_trip } = of;
+    let KnownRoute { here, interface, there, missed, round_trip } = of;
     RouteReport {
         here: here.to_string(),
+        interface: interface.clone(),
         there: there.to_string(),
         missed: *missed,
         round_trip_ns: round_trip.map(nanos),

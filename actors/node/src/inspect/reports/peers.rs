@@ -193,6 +193,9 @@ pub struct PeerReport {
 pub struct RouteReport {
     /// The UDP address of the reporting node.
     pub here: String,
+    /// The name of the interface with that address; `None` if `ndl.interface` names addresses alone.
+    #[serde(default)]
+    pub interface: Option<String>,
     /// The UDP address of the other node.
     pub there: String,
     /// Number of consecutive rounds of queries without an answer on this route.
