@@ -88,7 +88,7 @@ print(int.from_bytes(client.recv(4096)[8:12], "little"), flush=True)
 fn ended_process_does_not_get_the_name_of_a_command() {
     // Given: a process that leads the group of a command, and its connection, which a child of it holds.
     let node = TestNode::start();
-    let (port, _) = super::commands::command(&node);
+    let (port, _) = command(&node);
     let Some(mut python) = python_with(FORKING_BEFORE) else { return };
     let python = python.arg(node.path()).arg(registration("knee")).process_group(0);
     let mut parent =
