@@ -11,7 +11,7 @@ use rustix::process::{Pid, WaitId, WaitIdOptions, waitid};
 use sinew_figures::documentation::python_with;
 use sinew_runtime::{tid::NodeAddress, wire::encode_frame};
 
-use super::*;
+use super::{commands::command, *};
 
 /// Registers with the given bytes, forks, and waits to be killed; its child keeps the socket open until it is
 /// requested to end.
