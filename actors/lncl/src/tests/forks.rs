@@ -85,7 +85,7 @@ print(int.from_bytes(client.recv(4096)[8:12], "little"), flush=True)
 
 // spec: LNCL-22
 #[test]
-fn ended_process_does_not_get_the_name_of_a_command() {
+fn ended_process_does_not_get_a_commands_name() {
     // Given: a process that leads the group of a command, and its connection, which a child of it holds.
     let node = TestNode::start();
     let (port, _) = command(&node);

@@ -1,6 +1,14 @@
 //! Direct links of tasks: with each other, and with threads.
 
-use std::{cell::Cell, thread, time::Duration};
+use std::{
+    cell::Cell,
+    sync::{
+        Arc,
+        atomic::{AtomicBool, Ordering},
+    },
+    thread,
+    time::Duration,
+};
 
 use futures_util::poll;
 use sinew_lncl::testing::{TestNode, WATCHDOG};
@@ -100,30 +108,35 @@ fn tasks_and_threads_have_links_with_each_other() {
     let mut blocking =
         NodeApi::connect(node.path()).unwrap().register_transport_address(with_links()).unwrap();
     let thread_tid = blocking.tid();
+    let thread_has_link = Arc::new(AtomicBool::new(false));
+    let seen_by_thread = thread_has_link.clone();
     let thread = thread::spawn(move || {
-        let mut is_direct = false;
         while let Some(request) = blocking.receive(WATCHDOG).unwrap() {
-            is_direct |= has_link(&blocking, request.source());
+            if has_link(&blocking, request.source()) {
+                seen_by_thread.store(true, Ordering::SeqCst);
+            }
             if !request.wants_reply() {
-                return is_direct;
+                return;
             }
             let reply = blocking.create_message(request.source(), RAW, 8).unwrap();
             blocking.loaned(reply).reply_to(&request).unwrap();
         }
         panic!("the last word did not come");
     });
-    let is_direct = runtime().block_on(async {
+    runtime().block_on(async {
         let mut endpoint = task(&node).await;
-        let mut is_direct = false;
-        for _ in 0..200 {
+        let deadline = Time::now() + WATCHDOG;
+        let has_both = |endpoint: &AsyncEndpoint| {
+            has_link(&endpoint.endpoint, thread_tid) && thread_has_link.load(Ordering::SeqCst)
+        };
+        while !has_both(&endpoint) {
+            assert!(Time::now() < deadline, "waited for a link in each direction");
             let request = endpoint.create_message(thread_tid, RAW, 8).unwrap();
             drop(endpoint.loaned(request).ask_raw(WATCHDOG).await.unwrap());
-            is_direct |= has_link(&endpoint.endpoint, thread_tid);
         }
         send(&mut endpoint, thread_tid, 0, 8).await;
-        is_direct
     });
-    assert!(is_direct && thread.join().unwrap());
+    thread.join().unwrap();
 }
 
 #[test]
