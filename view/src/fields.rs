@@ -7,6 +7,7 @@ use serde::{
     Deserialize as _, Deserializer,
     de::{self, DeserializeSeed, IgnoredAny, MapAccess, SeqAccess, Visitor},
 };
+use sinew::protection::unsealed;
 
 /// Numbers of one payload. Further ones are left out.
 pub(crate) const NUMBERS_MAX: usize = 64;
@@ -15,8 +16,10 @@ const PATH_MAX: usize = 128;
 /// Maximum nesting depth of a payload: as in a node.
 const DEPTH_MAX: usize = 64;
 
-/// Hands over the numbers of a payload. Truths are 0 and 1. Bytes that are no payload have no numbers after a fault.
+/// Hands over the numbers of a payload; those of a protected one are in its envelope. Truths are 0 and 1. Bytes that are
+/// no payload have no numbers after a fault.
 pub(crate) fn numbers(payload: &[u8], take: &mut dyn FnMut(&str, f64)) {
+    let payload = unsealed(payload).map_or(payload, |unsealed| unsealed.payload);
     let mut deserializer = rmp_serde::Deserializer::new(Cursor::new(payload));
     deserializer.set_max_depth(DEPTH_MAX);
     let (mut path, mut left) = (String::new(), NUMBERS_MAX);
@@ -186,6 +189,20 @@ mod tests {
         let mut found = Vec::new();
         numbers(payload, &mut |path, value| found.push((path.to_owned(), value)));
         found
+    }
+
+    #[test]
+    fn numbers_of_protected_payloads_are_in_their_envelopes() {
+        use sinew::{
+            Tid, Time,
+            protection::{DataId, Stamp, seal},
+        };
+        let joint =
+            rmp_serde::to_vec_named(&Joint { name: "knee", angle: 0.5, is_safe: true }).expect("it is a map");
+        let data_id = DataId { source: Tid::from_bits(1), destination: Tid::from_bits(2), name: "exo.joint" };
+        let stamp = Stamp { counter: 3, incarnation: 7, echo: Time::ZERO };
+        assert_eq!(found(&seal(&data_id, stamp, &joint)), found(&joint));
+        assert_eq!(found(&joint).len(), 2);
     }
 
     #[test]
