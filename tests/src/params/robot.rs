@@ -41,6 +41,8 @@ pub(super) struct Robot {
     /// The arguments of all nodes: the group, the number of the project, and the access list.
     shared: [String; 3],
     nodes: Vec<NodeProcess>,
+    /// Answers to orders that came before they were waited for, by coordinator.
+    answers: Vec<Option<String>>,
 }
 
 impl Answer {
@@ -67,7 +69,8 @@ impl Robot {
         // No rule lets the applications send to each other: a transaction needs none.
         let access = directory.write("access.toml", "[roles]\noperators = ['operator.*']\n");
         let shared = [own_group().to_string(), unique().to_string(), access.display().to_string()];
-        let mut robot = Self { hosts, _directory: directory, shared, nodes: Vec::new() };
+        let answers = vec![None; NODES];
+        let mut robot = Self { hosts, _directory: directory, shared, nodes: Vec::new(), answers };
         robot.nodes = (0..NODES).map(|node| robot.process(node)).collect();
         robot.nodes.iter_mut().for_each(|node| drop(node.wait_for(&["up"])));
         Ok(robot)
@@ -86,6 +89,7 @@ impl Robot {
     /// Starts a node again that was killed.
     pub(super) fn start_node(&mut self, node: usize) {
         self.nodes[node] = self.process(node);
+        self.answers[node] = None;
         self.nodes[node].wait_for(&["up"]);
     }
 
@@ -102,7 +106,12 @@ impl Robot {
     }
 
     pub(super) fn look(&mut self, node: usize) -> Seen {
-        let line = self.nodes[node].ask("look");
+        let mut line = self.nodes[node].ask("look");
+        if line.starts_with('{') {
+            // The answer to an order has come before.
+            let answer = std::mem::replace(&mut line, self.nodes[node].wait_for(&[]));
+            self.answers[node] = Some(answer);
+        }
         let [value, since_ns] = sinew_testkit::numbers(&line)[..] else { panic!("node {node}: {line:?}") };
         Seen { value, since_ns }
     }
@@ -115,7 +124,7 @@ impl Robot {
 
     /// Waits for the answer to an order.
     pub(super) fn answer(&mut self, coordinator: usize) -> Answer {
-        let line = self.nodes[coordinator].wait_for(&[]);
+        let line = self.answers[coordinator].take().unwrap_or_else(|| self.nodes[coordinator].wait_for(&[]));
         Answer::read(&line).unwrap_or_else(|| panic!("the transaction did not begin: {line}"))
     }
 
