@@ -16,8 +16,8 @@ const PATH_MAX: usize = 128;
 /// Maximum nesting depth of a payload: as in a node.
 const DEPTH_MAX: usize = 64;
 
-/// Hands over the numbers of a payload; those of a protected one are in its envelope. Truths are 0 and 1. Bytes that are
-/// no payload have no numbers after a fault.
+/// Hands over the numbers of a payload; those of a protected one are in its envelope. Truths are 0 and 1. Bytes that
+/// are no payload have no numbers after a fault.
 pub(crate) fn numbers(payload: &[u8], take: &mut dyn FnMut(&str, f64)) {
     let payload = unsealed(payload).map_or(payload, |unsealed| unsealed.payload);
     let mut deserializer = rmp_serde::Deserializer::new(Cursor::new(payload));
