@@ -80,7 +80,8 @@ impl Drop for Robot {
     }
 }
 
-fn runs(process: u64) -> bool {
+/// Whether a process runs: one that has ended may still wait for its parent.
+pub(crate) fn runs(process: u64) -> bool {
     let stat = fs::read_to_string(format!("/proc/{process}/stat")).unwrap_or_default();
     stat.rsplit_once(')').is_some_and(|(_, rest)| !rest.trim_start().starts_with('Z'))
 }
