@@ -238,7 +238,7 @@ pub(crate) enum Command {
     /// hashes of their contents, and the keys of a node only to its host: to this host directly, to others by the
     /// system's `ssh`. Nothing is stopped before all files are there. A node starts once those in its `after` are
     /// ready. Each wait has a deadline, and names the applications that block and their reasons. Run again, it changes
-    /// only the nodes whose program, files, keys or settings changed.
+    /// only the nodes with a changed program, file, key or setting.
     ///
     /// Exit code 0: all nodes are ready. 1: they are not, a host cannot be reached, or a file is missing.
     #[command(after_help = r#"Examples:

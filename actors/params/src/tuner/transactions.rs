@@ -18,8 +18,8 @@ use crate::{
 /// Maximum number of transactions with a known outcome. The oldest one is forgotten.
 const CONCLUDED_MAX: usize = 16;
 
-/// The largest error of the stated time, as a part of the lead. Between a participant whose clock is late by it and one
-/// whose clock is early by it, a quarter of the lead is left for the result.
+/// Maximum error of the stated time, as a part of the lead. If the clock of one participant is late by it, and that of
+/// another is early by it, a quarter of the lead is left for the result.
 const CLOCK_SHARE: u32 = 8;
 
 /// Time between two looks at whether an application without a next tick can apply agreed values: its timer may have

@@ -1,4 +1,4 @@
-//! The rules of Sinew's WAN link over Zenoh: a virtual IPv4 network whose packets are Zenoh puts.
+//! The rules of Sinew's WAN link over Zenoh: a virtual IPv4 network that sends each packet as a put.
 //!
 //! Each host has one address in this network, on a TUN device. The nodes of the host use that address like one
 //! of an Ethernet interface. So discovery, TLS, sessions, acknowledgements and the fencing of incarnations run
