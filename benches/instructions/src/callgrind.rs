@@ -47,7 +47,8 @@ impl Counted {
         self.started += 1;
         let plain = process::command(role);
         let mut command = Command::new("valgrind");
-        command.args(["--quiet", "--tool=callgrind"]);
+        // Threads run in the order in which they became ready.
+        command.args(["--quiet", "--tool=callgrind", "--fair-sched=yes"]);
         command.arg(format!(
             "--callgrind-out-file={}",
             self.directory.join(format!("{}.out", self.started)).display()

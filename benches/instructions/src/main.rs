@@ -20,6 +20,7 @@ mod stored;
 use std::{path::PathBuf, process::ExitCode};
 
 use clap::Parser;
+use sinew_figures::{End, Pinning};
 
 use crate::{paths::Path, stored::Verdict};
 
@@ -67,6 +68,8 @@ fn main() -> ExitCode {
         (false, Some(directory)) => Counting::Keep(directory),
         (false, None) => Counting::Compare,
     };
+    // With a CPU each, it would differ from run to run which thread or process wakes first.
+    Pinning::OneCpu.pin(End::Measuring);
     match run(&wanted, &counting) {
         Ok(true) => ExitCode::SUCCESS,
         Ok(false) => ExitCode::FAILURE,
