@@ -162,8 +162,8 @@ pub mod node {
     #[doc(inline)]
     pub use sinew_node::{
         AccessError, AccessSummary, AuditError, CommandError, DenyListError, DenyListSummary, LifeState,
-        MailboxState, Node, NodeBuilder, NodeEnd, NodeHandle, OutletCounts, RegisterError, StartError,
-        Supervised, Supervises, SupervisionTree, Traffic,
+        MailboxState, MessageAges, Node, NodeBuilder, NodeEnd, NodeHandle, OutletCounts, RegisterError,
+        StartError, Supervised, Supervises, SupervisionTree, Traffic,
     };
 }
 

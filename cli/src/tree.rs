@@ -113,6 +113,7 @@ mod tests {
             waiting: Some(12),
             waiting_most: Some(512),
             oldest_us: None,
+            ages: None,
             strategy: Some("one for one".to_owned()),
         };
         let report = TreeReport { name: name.clone(), lines: [0, 1, 9].map(line).to_vec(), left_out: 0 };

@@ -29,8 +29,17 @@ fn named(text: &str) -> BTreeSet<String> {
     words.filter(|word| word.starts_with("sinew_")).map(str::to_owned).collect()
 }
 
+/// Returns the names of all metrics, and of the samples of histograms.
 fn all() -> BTreeSet<String> {
-    METRICS.iter().map(sinew_view::Metric::full_name).collect()
+    let mut names = BTreeSet::new();
+    for metric in METRICS {
+        let name = metric.full_name();
+        if metric.shape == Shape::Histogram {
+            names.extend(["_bucket", "_count", "_sum"].map(|suffix| format!("{name}{suffix}")));
+        }
+        names.insert(name);
+    }
+    names
 }
 
 /// Returns the expressions of a dashboard, wherever they are in it.
@@ -88,6 +97,7 @@ fn table() -> String {
         let kind = match metric.shape {
             Shape::Counter => "counter",
             Shape::Gauge => "gauge",
+            Shape::Histogram => "histogram",
         };
         let labels: Vec<_> = metric.labels.iter().map(|label| format!("`{label}`")).collect();
         let labels = if labels.is_empty() { "-".to_owned() } else { labels.join(", ") };

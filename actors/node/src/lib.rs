@@ -67,6 +67,7 @@ pub use node::{Node, NodeEnd};
 pub(crate) use progress::Stalls;
 pub(crate) use root::{RootEvent, WAITS_MAX};
 pub use sinew_lncl::RegisterError;
+pub use sinew_runtime::mailbox::MessageAges;
 pub use sinew_security::{
     access::{AccessError, AccessSummary},
     node_security::{DenyListError, DenyListSummary},

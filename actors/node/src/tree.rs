@@ -6,6 +6,7 @@ use std::{fmt, sync::atomic::Ordering, time::Duration};
 use sinew_model::directory::Absence;
 use sinew_runtime::{
     lock,
+    mailbox::MessageAges,
     supervision::{BranchView, ChildId, ChildState, ChildView, Flags, Reason, Strategy, SupervisorHandle},
     tid::Tid,
     time::Time,
@@ -108,7 +109,7 @@ pub enum LifeState {
     Down,
 }
 
-/// The number of messages in a mailbox.
+/// The messages in a mailbox, and the ages of those that were handled.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct MailboxState {
     /// Number of messages that wait now.
@@ -117,6 +118,8 @@ pub struct MailboxState {
     pub high_water: usize,
     /// Age of the oldest one; `None`: none waits, or its age is unknown.
     pub oldest: Option<Duration>,
+    /// Ages of the delivered ones when their handlers were called; none of an actor in a process of its own.
+    pub ages: MessageAges,
 }
 
 /// The settings and the children of a supervisor.
@@ -269,6 +272,7 @@ impl Root {
                 depth: mailbox.depth(),
                 high_water: mailbox.high_water(),
                 oldest: mailbox.oldest(),
+                ages: mailbox.ages(),
             }),
             missing,
             abandoned: view.abandoned,

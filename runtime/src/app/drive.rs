@@ -23,7 +23,7 @@ use crate::{
     },
     clock::ClockAlarm,
     incident::{self, IncidentKind},
-    mailbox::MailboxReader,
+    mailbox::{MailboxReader, is_event},
     outcome::{Outcome, Rejection},
     protection::{Echo, ProtectionError, Verdict},
     remedy::{Wanted, remedy},
@@ -31,7 +31,7 @@ use crate::{
     schedule::Due,
     supervision::liveness::{Activity, Liveness},
     time::Time,
-    wire::{Kind, Message, Payload, decode_as},
+    wire::{Flags, Header, Kind, Message, Payload, decode_as},
 };
 
 /// Maximum number of messages and timers handled before the other tasks of the thread have their turn.
@@ -259,7 +259,7 @@ impl<A: Actor<Context = AppContext<A>>> Drive<A> {
         self.leave_if_over();
         let outcome = self.dispatch(actor, context, message, now);
         self.leave_if_over();
-        self.reader.finish(outcome);
+        self.reader.finish_aged(outcome, counted_age_ns(&message.header, now));
         if is_confirmed {
             self.liveness.settle(outcome);
         }
@@ -372,6 +372,15 @@ where
     (!context.clock.is_virtual()).then_some(now)
 }
 
+/// Returns the age in nanoseconds that the mailbox counts. Events of layers were sent by no application, and the age of
+/// a retained value is no property of its path.
+fn counted_age_ns(header: &Header, now: Time) -> Option<u64> {
+    if !header.kind.is_user() || is_event(header) || header.flags.has(Flags::RETAINED) {
+        return None;
+    }
+    Some(now.as_nanos().saturating_sub(header.known_sent()?.as_nanos()))
+}
+
 fn fire<A>(actor: &mut A, context: &mut AppContext<A>, mut due: Due<Action<A>>, now: Time)
 where
     A: Actor<Context = AppContext<A>>,
@@ -425,4 +434,30 @@ where
         IncidentKind::Symptom,
         format_args!("an input of {} is late: {timeout}", context.tid()),
     );
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::tid::{AppAddress, NodeAddress, Tid};
+
+    #[test]
+    fn ages_of_events_and_retained_values_are_not_counted() {
+        let node = NodeAddress::new(1);
+        let app = |number| Tid::new(node, AppAddress::new(number));
+        let mut header = Header::new(Kind::named("test"), app(0x8000_0001), app(0x8000_0002));
+        header.sent = Time::from_nanos(1_000);
+        let age_ns = |header: &Header| counted_age_ns(header, Time::from_nanos(5_000));
+        assert_eq!(age_ns(&header), Some(4_000));
+        let event = Header { source: Tid::new(node, AppAddress::SYNC), ..header };
+        let retained = Header { flags: Flags::RETAINED, ..header };
+        let of_unknown_age = {
+            let mut header = header;
+            header.set_sent_error(None);
+            header
+        };
+        for header in [event, retained, Header { kind: Kind::PING, ..header }, of_unknown_age] {
+            assert_eq!(age_ns(&header), None);
+        }
+    }
 }

@@ -5,6 +5,7 @@
 //! next incarnation. Queue and waker are under one mutex, see [`event_queue`](crate::event_queue).
 
 mod about;
+mod ages;
 mod backlog;
 mod budget;
 mod ends;
@@ -22,14 +23,15 @@ use std::{
     collections::VecDeque,
     sync::{Arc, Mutex, OnceLock, atomic::AtomicBool},
     task::Waker,
-    time::Duration,
 };
 
 pub use about::About;
+pub use ages::{AGE_BOUNDS_US, AGE_BUCKETS, MessageAges};
 pub(crate) use backlog::Backlog;
 use backlog::WaitRecord;
 pub use budget::Budget;
 pub use queue::{Bounds, ClassQueue, is_same_stream};
+use reader::Finished;
 pub use reader::MailboxReader;
 pub use remote_reader::RemoteReader;
 use room::RoomWakers;
@@ -90,6 +92,7 @@ struct Shared {
     /// Whether the application is down and its policy keeps no messages.
     refuses: bool,
     tallies: [Tally; 3],
+    ages: MessageAges,
     high_water: usize,
 }
 
@@ -187,9 +190,10 @@ impl Shared {
     }
 
     /// Counts the outcome of the reader's current message.
-    fn count(&mut self, finished: Option<(Class, Outcome)>) {
-        if let Some((class, outcome)) = finished {
+    fn count(&mut self, finished: Option<Finished>) {
+        if let Some(Finished { class, outcome, age_ns }) = finished {
             self.tallies[class as usize].count(outcome);
+            self.ages.count(outcome, age_ns);
             self.current = None;
         }
     }
@@ -247,6 +251,7 @@ impl Mailbox {
             closed: false,
             refuses: false,
             tallies: [Tally::default(); 3],
+            ages: MessageAges::default(),
             high_water: 0,
         };
         let records_waits = AtomicBool::new(false);
@@ -360,13 +365,6 @@ impl Mailbox {
     #[must_use]
     pub fn high_water(&self) -> usize {
         lock(&self.shared).high_water
-    }
-
-    /// Returns the age of the oldest queued message; `None`: none is queued, or its age is unknown.
-    #[must_use]
-    pub fn oldest(&self) -> Option<Duration> {
-        let now = self.clock.now();
-        lock(&self.shared).queue.oldest(now)
     }
 
     /// Returns the results of the messages of `class`, and the number that is queued, being handled or in

@@ -12,13 +12,22 @@ use crate::{
     wire::{Class, Message},
 };
 
+/// A message that the reader has handled.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Finished {
+    pub(super) class: Class,
+    pub(super) outcome: Outcome,
+    /// Its age in nanoseconds when its handler was called, if it is counted.
+    pub(super) age_ns: Option<u64>,
+}
+
 /// The reading end of a [`Mailbox`], owned by one incarnation of an actor.
 #[derive(Debug)]
 pub struct MailboxReader {
     mailbox: Arc<Mailbox>,
     epoch: u64,
     current: Option<Class>,
-    finished: Option<(Class, Outcome)>,
+    finished: Option<Finished>,
     /// Whether the last taken message left none behind. A hint, which is checked under the lock.
     seems_empty: bool,
 }
@@ -108,10 +117,16 @@ impl MailboxReader {
     /// [`poll_take`](Self::poll_take), under its lock, or when this reader is dropped.
     #[inline]
     pub fn finish(&mut self, outcome: Outcome) {
+        self.finish_aged(outcome, None);
+    }
+
+    /// Same as [`finish`](Self::finish), for a message of this age in nanoseconds, by which it is counted if delivered.
+    #[inline]
+    pub(crate) fn finish_aged(&mut self, outcome: Outcome, age_ns: Option<u64>) {
         let Some(class) = self.current.take() else { return };
         match &self.mailbox.source {
             Some(source) => source.finish(outcome),
-            None => self.finished = Some((class, outcome)),
+            None => self.finished = Some(Finished { class, outcome, age_ns }),
         }
     }
 }
@@ -148,7 +163,8 @@ impl Drop for MailboxReader {
         let mut shared = lock(&self.mailbox.shared);
         if shared.epoch == self.epoch {
             shared.count(self.finished.take());
-            shared.count(self.current.take().map(|class| (class, Outcome::Failed)));
+            let failed = |class| Finished { class, outcome: Outcome::Failed, age_ns: None };
+            shared.count(self.current.take().map(failed));
         }
     }
 }

@@ -1,6 +1,9 @@
 //! Mailboxes and their readers: their lifetimes, and the outcome of each message.
 
-use std::task::{Context, Poll};
+use std::{
+    task::{Context, Poll},
+    time::Duration,
+};
 
 use bytes::Bytes;
 use futures_util::task::noop_waker;
@@ -204,4 +207,20 @@ fn age_of_the_oldest_message_is_known() {
     }
     // Then: the newer ones remain
     assert!(mailbox.oldest().is_some_and(|age| age >= Duration::from_secs(3)));
+}
+
+#[test]
+fn ages_of_delivered_messages_are_counted() {
+    let mailbox = Mailbox::new(8);
+    let mut reader = mailbox.attach();
+    for outcome in [Outcome::Delivered, Outcome::Failed] {
+        mailbox.submit(message()).unwrap();
+        assert!(matches!(take(&mut reader), Poll::Ready(Some(_))));
+        reader.finish_aged(outcome, Some(30_000));
+    }
+    // Its last message is counted when the reader ends.
+    drop(reader);
+    let ages = mailbox.ages();
+    assert_eq!((ages.counts[1], ages.counts.iter().sum::<u64>()), (1, 1));
+    assert_eq!(ages.sum_ns, 30_000);
 }

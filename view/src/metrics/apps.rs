@@ -11,8 +11,8 @@ use super::{
     samples::Samples,
     system::{micros, truth},
     table::{
-        APP_MISSING, APP_READY, APPS, BARRIER_BLOCKED, BARRIER_WAIT, GUARD_CAUSE, GUARD_FAILED, GUARD_SAFE,
-        MAILBOX_DEPTH, MAILBOX_DEPTH_MAX, MAILBOX_OLDEST, RESTARTS,
+        APP_AGE, APP_MISSING, APP_READY, APPS, BARRIER_BLOCKED, BARRIER_WAIT, GUARD_CAUSE, GUARD_FAILED,
+        GUARD_SAFE, MAILBOX_DEPTH, MAILBOX_DEPTH_MAX, MAILBOX_OLDEST, RESTARTS,
     },
 };
 use crate::{nodes::bounded, snapshot::Answers};
@@ -89,6 +89,13 @@ fn add_tree(samples: &mut Samples, tree: &TreeReport, node: &str, names: &mut Ap
         if line.waiting.is_some() {
             samples.level(&MAILBOX_OLDEST, [node, &label], micros(line.oldest_us.unwrap_or(0)));
         }
+    }
+}
+
+/// Adds the ages of handled messages, with the labels of the node's other metrics.
+pub(super) fn add_ages(samples: &mut Samples, tree: &TreeReport, node: &str, names: &mut AppNames) {
+    for (line, ages) in tree.lines.iter().filter_map(|line| Some((line, line.ages.as_ref()?))) {
+        samples.ages(&APP_AGE, [node, &names.label(&line.name)], ages);
     }
 }
 

@@ -68,12 +68,18 @@ fn samples(snapshot: &Snapshot, foxglove: Option<Counts>, now: Time) -> Samples 
     if let Some(counts) = foxglove {
         system::add_foxglove(&mut samples, counts);
     }
+    let mut all_names = Vec::new();
     for answers in snapshot.answers() {
         let node = labels.get(answers.node.node);
         system::add_node(&mut samples, answers, &node);
         peers::add(&mut samples, &answers.node, &node, &labels);
         let mut names = apps::add(&mut samples, answers, &node, &snapshot.own);
         messages::add(&mut samples, &answers.audit, &node, (&mut names, &labels));
+        all_names.push(names);
+    }
+    // They have the most samples: beyond the bound they are left out first.
+    for (answers, names) in snapshot.answers().zip(&mut all_names) {
+        apps::add_ages(&mut samples, &answers.tree, &labels.get(answers.node.node), names);
     }
     samples.finish()
 }

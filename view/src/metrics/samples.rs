@@ -8,8 +8,12 @@ use prometheus_client::{
     metrics::MetricType,
     registry::Unit,
 };
+use sinew::inspect::{AGE_BOUNDS_US, AGE_BUCKETS, AgesReport};
 
-use super::table::{METRICS, Metric, SAMPLES_LEFT_OUT, Shape};
+use super::{
+    system::micros,
+    table::{METRICS, Metric, SAMPLES_LEFT_OUT, Shape},
+};
 
 /// Maximum number of samples of one answer: some 10 MB. Further ones are counted.
 const SAMPLES_MAX: usize = 100_000;
@@ -22,10 +26,32 @@ enum Value {
     Level(f64),
 }
 
+/// The samples of a histogram.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct Times {
+    counts: [u64; AGE_BUCKETS],
+    /// In seconds.
+    sum: f64,
+}
+
+impl Times {
+    /// Number of lines of a histogram: its buckets, their sum and their number.
+    const LINES: usize = AGE_BUCKETS + 2;
+
+    /// Returns the upper bound of each bucket in seconds, and the number of times in it. The encoder adds these
+    /// numbers up. Another node may report any, so each is limited.
+    fn buckets(&self) -> Vec<(f64, u64)> {
+        let bounds = AGE_BOUNDS_US.iter().map(|bound| micros(*bound)).chain([f64::INFINITY]);
+        let counts = self.counts.iter().map(|count| (*count).min(u64::MAX / AGE_BUCKETS as u64));
+        bounds.zip(counts).collect()
+    }
+}
+
 /// The samples of one answer. A set of labels has one sample of each metric.
 #[derive(Debug, Default)]
 pub(super) struct Samples {
     families: BTreeMap<&'static str, BTreeMap<Labels, Value>>,
+    histograms: BTreeMap<&'static str, BTreeMap<Labels, Times>>,
     count: usize,
     left_out: u64,
 }
@@ -44,9 +70,7 @@ impl Samples {
     }
 
     fn merge<const N: usize>(&mut self, metric: &Metric, labels: [&str; N], value: Value) {
-        debug_assert_eq!(metric.labels.len(), N, "the labels of {}", metric.name);
-        let labels: Labels =
-            metric.labels.iter().copied().zip(labels).map(|(key, text)| (key, text.to_owned())).collect();
+        let labels = named(metric, labels);
         let family = self.families.entry(metric.name).or_default();
         if let Some(known) = family.get_mut(&labels) {
             *known = match (*known, value) {
@@ -63,6 +87,26 @@ impl Samples {
         }
     }
 
+    /// Adds to a histogram. Values for the same labels are added up. Buckets of another version are ignored.
+    pub(super) fn ages<const N: usize>(&mut self, metric: &Metric, labels: [&str; N], report: &AgesReport) {
+        debug_assert_eq!(metric.shape, Shape::Histogram, "{}", metric.name);
+        let Ok(counts) = <[u64; AGE_BUCKETS]>::try_from(report.counts.as_slice()) else { return };
+        let sum = micros(report.sum_us);
+        let labels = named(metric, labels);
+        let family = self.histograms.entry(metric.name).or_default();
+        if let Some(known) = family.get_mut(&labels) {
+            known.sum += sum;
+            for (known, count) in known.counts.iter_mut().zip(counts) {
+                *known = known.saturating_add(count);
+            }
+        } else if self.count + Times::LINES <= SAMPLES_MAX {
+            family.insert(labels, Times { counts, sum });
+            self.count += Times::LINES;
+        } else {
+            self.left_out += Times::LINES as u64;
+        }
+    }
+
     /// Adds the number of left-out samples, which has room in any case.
     pub(super) fn finish(mut self) -> Self {
         let left_out = Value::Level(self.left_out as f64);
@@ -71,26 +115,42 @@ impl Samples {
     }
 }
 
+/// Returns the labels with their names.
+fn named<const N: usize>(metric: &Metric, labels: [&str; N]) -> Labels {
+    debug_assert_eq!(metric.labels.len(), N, "the labels of {}", metric.name);
+    metric.labels.iter().copied().zip(labels).map(|(key, text)| (key, text.to_owned())).collect()
+}
+
 const fn kind(shape: Shape) -> MetricType {
     match shape {
         Shape::Counter => MetricType::Counter,
         Shape::Gauge => MetricType::Gauge,
+        Shape::Histogram => MetricType::Histogram,
     }
 }
 
 impl Collector for Samples {
     fn encode(&self, mut encoder: DescriptorEncoder<'_>) -> fmt::Result {
         for metric in METRICS {
-            let Some(family) = self.families.get(metric.name) else { continue };
+            let (family, times) = (self.families.get(metric.name), self.histograms.get(metric.name));
+            if family.is_none() && times.is_none() {
+                continue;
+            }
             let unit = metric.is_seconds.then_some(Unit::Seconds);
             let mut descriptor =
                 encoder.encode_descriptor(metric.name, metric.help, unit.as_ref(), kind(metric.shape))?;
-            for (labels, value) in family {
+            for (labels, value) in family.into_iter().flatten() {
                 let mut sample = descriptor.encode_family(labels)?;
                 match value {
                     Value::Count(count) => sample.encode_counter::<NoLabelSet, _, f64>(count, None)?,
                     Value::Level(level) => sample.encode_gauge(level)?,
                 }
+            }
+            for (labels, times) in times.into_iter().flatten() {
+                let buckets = times.buckets();
+                let count: u64 = buckets.iter().map(|(_, count)| count).sum();
+                let mut sample = descriptor.encode_family(labels)?;
+                sample.encode_histogram::<NoLabelSet>(times.sum, count, &buckets, None)?;
             }
         }
         Ok(())
@@ -100,7 +160,7 @@ impl Collector for Samples {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::metrics::table::{NODE_UP, REFUSED};
+    use crate::metrics::table::{APP_AGE, NODE_UP, REFUSED};
 
     #[test]
     fn counters_add_up_and_gauges_keep_the_greatest() {
@@ -126,5 +186,21 @@ mod tests {
         let samples = samples.finish();
         assert_eq!((samples.count, samples.families[NODE_UP.name].len()), (SAMPLES_MAX, SAMPLES_MAX));
         assert_eq!(samples.families[SAMPLES_LEFT_OUT.name][&Vec::new()], Value::Level(7.0));
+    }
+
+    #[test]
+    fn buckets_of_any_node_are_added_up_within_bounds() {
+        let mut samples = Samples::default();
+        let report = |counts: Vec<u64>| AgesReport { counts, sum_us: 2_000_000 };
+        for count in [1, 2, u64::MAX] {
+            samples.ages(&APP_AGE, ["hip", "drive"], &report(vec![count; AGE_BUCKETS]));
+        }
+        // Another version has other bounds.
+        samples.ages(&APP_AGE, ["hip", "gait"], &report(vec![1]));
+        assert_eq!(samples.count, Times::LINES);
+        let times: Vec<_> = samples.histograms[APP_AGE.name].values().copied().collect();
+        assert_eq!(times, [Times { counts: [u64::MAX; AGE_BUCKETS], sum: 6.0 }]);
+        let buckets = times[0].buckets();
+        assert!(buckets.iter().try_fold(0_u64, |sum, (_, count)| sum.checked_add(*count)).is_some());
     }
 }

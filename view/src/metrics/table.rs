@@ -10,6 +10,9 @@ pub enum Shape {
     Counter,
     /// A value at this moment.
     Gauge,
+    /// Counts of times by their length, and their sum, since the node's start; the names of its samples end in
+    /// `_bucket`, `_count` and `_sum`.
+    Histogram,
 }
 
 /// A metric.
@@ -28,7 +31,7 @@ pub struct Metric {
 }
 
 impl Metric {
-    /// Returns the name of its samples.
+    /// Returns the name of its samples; of a histogram, the part that they share.
     ///
     /// # Examples
     ///
@@ -56,6 +59,10 @@ const fn gauge(name: &'static str, labels: &'static [&'static str], help: &'stat
 
 const fn seconds(name: &'static str, labels: &'static [&'static str], help: &'static str) -> Metric {
     Metric { name, shape: Shape::Gauge, is_seconds: true, labels, help }
+}
+
+const fn times(name: &'static str, labels: &'static [&'static str], help: &'static str) -> Metric {
+    Metric { name, shape: Shape::Histogram, is_seconds: true, labels, help }
 }
 
 const NODE: &[&str] = &["node"];
@@ -190,6 +197,12 @@ pub(super) const MAILBOX_OLDEST: Metric = seconds(
     "Age of the oldest message in the mailbox, since it was sent; 0 if none waits.",
 );
 
+pub(super) const APP_AGE: Metric = times(
+    "app_message_age",
+    APP,
+    "Age of each delivered message when its handler was called. An application in a process of its own has none.",
+);
+
 pub(super) const GUARD_SAFE: Metric =
     gauge("guard_safe", APP, "Whether an output that the application guards is safe: no command reaches it.");
 pub(super) const GUARD_CAUSE: Metric = gauge(
@@ -276,6 +289,7 @@ pub const METRICS: &[Metric] = &[
     MAILBOX_DEPTH,
     MAILBOX_DEPTH_MAX,
     MAILBOX_OLDEST,
+    APP_AGE,
     GUARD_SAFE,
     GUARD_CAUSE,
     GUARD_FAILED,

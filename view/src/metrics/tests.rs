@@ -10,9 +10,9 @@ use sinew::{
     address::Incarnation,
     audit::{Account, Entry, NodeAudit, Place},
     inspect::{
-        AppReport, AppsReport, BarrierReport, DialReport, GuardReport, LinkReport, LostReport, Missing,
-        NodeReport, PeerReport, RealTimeReport, RecordingReport, RetainedReport, StallReport, StreamReport,
-        TreeLine, TreeReport, WaitReport,
+        AgesReport, AppReport, AppsReport, BarrierReport, DialReport, GuardReport, LinkReport, LostReport,
+        Missing, NodeReport, PeerReport, RealTimeReport, RecordingReport, RetainedReport, StallReport,
+        StreamReport, TreeLine, TreeReport, WaitReport,
     },
     message::Class,
     stop::StopState,
@@ -222,6 +222,7 @@ fn tree(of: &NodeReport) -> TreeReport {
         waiting: Some(5),
         waiting_most: Some(17),
         oldest_us: Some(1_500),
+        ages: Some(AgesReport { counts: [vec![0, 3], vec![0; 15], vec![1]].concat(), sum_us: 20_000_100 }),
         strategy: None,
     };
     TreeReport { name: of.name.clone(), lines: vec![line], left_out: 0 }
@@ -272,7 +273,8 @@ fn each_metric_has_its_own_labels_in_both_formats() {
     for format in [Format::OpenMetrics, Format::PlainText] {
         let text = encode(&snapshot(), Some(FOXGLOVE), NOW, format).expect("it is written to memory");
         for metric in METRICS {
-            let name = metric.full_name();
+            let suffix = if metric.shape == Shape::Histogram { "_bucket" } else { "" };
+            let name = metric.full_name() + suffix;
             let line = text.lines().find(|line| line.split(['{', ' ']).next() == Some(&name));
             let line = line.unwrap_or_else(|| panic!("no sample of {name} in:\n{text}"));
             for label in LABELS {
@@ -293,7 +295,7 @@ fn names_and_labels_follow_the_conventions() {
         assert!(!metric.name.ends_with("_total") && !metric.name.ends_with("_seconds"), "{}", metric.name);
         assert!(metric.labels.iter().all(|label| LABELS.contains(label)), "{}", metric.name);
         assert!(metric.help.ends_with('.') && !metric.help.contains(['\n', '|']), "{}", metric.name);
-        assert!(metric.shape == Shape::Gauge || !metric.is_seconds, "{}", metric.name);
+        assert!(metric.shape != Shape::Counter || !metric.is_seconds, "{}", metric.name);
     }
 }
 
@@ -312,6 +314,10 @@ fn samples_have_base_units_and_the_names_of_nodes() {
         ("sinew_link_up{node=\"hip\",peer=\"knee\",class=\"control\"}", 1.0),
         ("sinew_restarts_total{node=\"hip\",app=\"drive\"}", 2.0),
         ("sinew_mailbox_oldest_seconds{node=\"hip\",app=\"drive\"}", 0.0015),
+        ("sinew_app_message_age_seconds_bucket{le=\"1.048576\",node=\"hip\",app=\"drive\"}", 3.0),
+        ("sinew_app_message_age_seconds_bucket{le=\"+Inf\",node=\"hip\",app=\"drive\"}", 4.0),
+        ("sinew_app_message_age_seconds_count{node=\"hip\",app=\"drive\"}", 4.0),
+        ("sinew_app_message_age_seconds_sum{node=\"hip\",app=\"drive\"}", 20.000_1),
         ("sinew_mailbox_depth_max{node=\"hip\",app=\"drive\"}", 17.0),
         ("sinew_barrier_wait_seconds{node=\"hip\",app=\"gait\"}", 31.0),
         ("sinew_barrier_wait_seconds{node=\"hip\",app=\"drive\"}", 7.0),

@@ -17,6 +17,7 @@ use sinew_model::{
 use sinew_ndl::{IdleApp, TroubledApp};
 use sinew_runtime::{
     lock,
+    mailbox::MessageAges,
     outcome::Rejection,
     protection::{OutputState, State, outputs},
     router::tap::Way,
@@ -30,9 +31,9 @@ use sinew_sync::OwnApp;
 
 use self::discovery::Discovery;
 use super::reports::{
-    APPS_MAX, AppReport, AppsReport, AuditReport, BarrierReport, CertificateReport, GuardReport, IdleReport,
-    KindReport, LISTED_MAX, MISSING_MAX, Missing, NodeReport, PEERS_MAX, SecurityReport, SeenMessage,
-    TREE_MAX, TreeLine, TreeReport, TroubleReport, WaitReport, WatchReport,
+    APPS_MAX, AgesReport, AppReport, AppsReport, AuditReport, BarrierReport, CertificateReport, GuardReport,
+    IdleReport, KindReport, LISTED_MAX, MISSING_MAX, Missing, NodeReport, PEERS_MAX, SecurityReport,
+    SeenMessage, TREE_MAX, TreeLine, TreeReport, TroubleReport, WaitReport, WatchReport,
 };
 use super::{
     reach, refused,
@@ -306,11 +307,18 @@ fn add_lines(lines: &mut Vec<TreeLine>, depth: u32, one: &Supervised) {
         waiting: one.mailbox.map(|mailbox| mailbox.depth as u64),
         waiting_most: one.mailbox.map(|mailbox| mailbox.high_water as u64),
         oldest_us: one.mailbox.and_then(|mailbox| mailbox.oldest).map(micros),
+        ages: one.mailbox.and_then(|mailbox| ages(&mailbox.ages)),
         strategy: one.supervises.as_ref().map(|below| strategy(below.flags.strategy).to_owned()),
     });
     for child in one.supervises.iter().flat_map(|below| &below.children) {
         add_lines(lines, depth + 1, child);
     }
+}
+
+/// Returns the ages, if there are any.
+fn ages(ages: &MessageAges) -> Option<AgesReport> {
+    let is_any = ages.counts.iter().any(|count| *count > 0);
+    is_any.then(|| AgesReport { counts: ages.counts.to_vec(), sum_us: ages.sum_ns / 1_000 })
 }
 
 const fn strategy(strategy: Strategy) -> &'static str {

@@ -42,9 +42,9 @@ pub(crate) use inspector::begin;
 #[cfg(test)]
 pub(crate) use record::recorded;
 pub use reports::{
-    APPS_MAX, AccessReport, AccessVerdict, AppReport, AppsReport, AskAccess, AskApps, AskAudit, AskFreeze,
-    AskFrozen, AskGroups, AskLogs, AskMismatches, AskNode, AskReach, AskRecord, AskReload, AskSchemas,
-    AskTree, AskWatch, AuditReport, BarrierReport, CertificateReport, DialReport, FROZEN_BUSY,
+    APPS_MAX, AccessReport, AccessVerdict, AgesReport, AppReport, AppsReport, AskAccess, AskApps, AskAudit,
+    AskFreeze, AskFrozen, AskGroups, AskLogs, AskMismatches, AskNode, AskReach, AskRecord, AskReload,
+    AskSchemas, AskTree, AskWatch, AuditReport, BarrierReport, CertificateReport, DialReport, FROZEN_BUSY,
     FROZEN_BYTES_MAX, FROZEN_SPANS_MAX, ForeignReport, FreezeReport, FrozenFacts, FrozenPart, FrozenReport,
     FrozenSpan, GroupReport, GuardReport, IdleReport, KindReport, LOG_LINES_MAX, LinkReport, LogLine,
     LogsReport, LostEchoReport, LostReport, MismatchReport, MismatchesReport, Missing, NodeReport, PEERS_MAX,
@@ -55,6 +55,7 @@ pub use reports::{
     TypeUser, UnguardedReport, UnhandledReport, WaitReport, WatchReport,
 };
 pub use sinew_record::{PeerClock, Selection};
+pub use sinew_runtime::mailbox::{AGE_BOUNDS_US, AGE_BUCKETS};
 
 #[cfg(doc)]
 use sinew_runtime::tid::AppAddress;

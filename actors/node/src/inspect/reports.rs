@@ -34,7 +34,7 @@ pub use real_time::RealTimeReport;
 pub use refused::{LostEchoReport, RefusalReport, UnguardedReport, UnhandledReport};
 pub use retained::RetainedReport;
 pub use security::{CertificateReport, SecurityReport};
-pub use tree::{AskTree, TREE_MAX, TreeLine, TreeReport};
+pub use tree::{AgesReport, AskTree, TREE_MAX, TreeLine, TreeReport};
 pub use types::{
     AskMismatches, AskSchemas, MismatchReport, MismatchesReport, SchemaReport, SchemasReport, TypeUser,
 };

@@ -45,6 +45,7 @@ fn tree() -> TreeReport {
         waiting: Some(3),
         waiting_most: Some(9),
         oldest_us: Some(1_500),
+        ages: None,
         strategy: None,
     };
     TreeReport { name: "hip".to_owned(), lines: vec![line], left_out: 0 }

@@ -135,6 +135,7 @@ fn app(name: &str) -> App {
         waiting: Some(0),
         waiting_most: Some(3),
         oldest_us: None,
+        ages: None,
         strategy: None,
     };
     App { report: Some(report), unreported: None, line: Some(line), refused: 0, direct: Vec::new() }

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 use sinew_model::bounded::at_most;
-use sinew_runtime::{tid::Tid, wire::Payload};
+use sinew_runtime::{mailbox::AGE_BUCKETS, tid::Tid, wire::Payload};
 
 use super::{Report, halve};
 
@@ -61,8 +61,22 @@ pub struct TreeLine {
     /// Age of the oldest one that waits; `None`: none waits, or an older version.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub oldest_us: Option<u64>,
+    /// Ages of the handled ones; `None`: none was handled in the node's own process, or an older version.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub ages: Option<AgesReport>,
     /// For a supervisor: which children it restarts when one fails.
     pub strategy: Option<String>,
+}
+
+/// The ages of the delivered messages of an application when its handlers were called, as a histogram.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct AgesReport {
+    /// Number of messages in each bucket, with the bounds of
+    /// [`AGE_BOUNDS_US`](sinew_runtime::mailbox::AGE_BOUNDS_US).
+    #[serde(deserialize_with = "at_most::<_, _, AGE_BUCKETS>")]
+    pub counts: Vec<u64>,
+    /// Sum of all ages.
+    pub sum_us: u64,
 }
 
 impl Report for TreeReport {
