@@ -18,7 +18,7 @@ use sinew_security::{files, state_files};
 
 use super::{
     core::Stops,
-    frame::{Entry, Origin},
+    frame::{ENTRIES_MAX, Entry, Origin},
 };
 
 /// Maximum bytes of the file: as many entries as a node keeps, with the longest reasons.
@@ -94,12 +94,20 @@ impl Kept {
 
 fn read(path: &Path) -> Result<Option<Stops>, String> {
     let Some(bytes) = files::own(path, BYTES_MAX).map_err(|why| why.to_string())? else { return Ok(None) };
-    let content: Content = decode(&bytes).map_err(|error| error.to_string())?;
+    let Content { mut entries } = decode(&bytes).map_err(|error| error.to_string())?;
     // Other nodes refuse states with such entries: they would not learn of a press.
-    if !content.entries.iter().all(Entry::is_legal) {
+    if !entries.iter().all(Entry::is_legal) {
         return Err("it has an entry that no node writes".to_owned());
     }
-    Ok(Some(content.entries.into_iter().collect()))
+    // The next press of this node is one more entry, and other nodes refuse a longer list. As in a full list, released
+    // ones are forgotten first.
+    if entries.len() > ENTRIES_MAX {
+        entries.retain(Entry::is_open);
+    }
+    if entries.len() > ENTRIES_MAX {
+        return Err(format!("it has more than {ENTRIES_MAX} presses that are not released"));
+    }
+    Ok(Some(entries.into_iter().collect()))
 }
 
 /// Returns the press of a node that does not know whether it was stopped.
@@ -135,7 +143,10 @@ mod tests {
     use std::time::Duration;
 
     use sinew_model::config::NodeConfig;
-    use sinew_runtime::{tid::Incarnation, time::Time};
+    use sinew_runtime::{
+        tid::{Incarnation, NodeAddress},
+        time::Time,
+    };
     use sinew_security::testing::Directory;
 
     use super::*;
@@ -161,6 +172,29 @@ mod tests {
         assert_eq!(Kept::begin(&context).1, Some(Stops::default()));
         std::fs::write(path, [0xc1]).expect("the test's own directory");
         assert!(Kept::begin(&context).1.is_some_and(|stops| stops.is_open()));
+    }
+
+    #[test]
+    fn list_that_other_nodes_refuse_is_not_read() {
+        let directory = Directory::new();
+        let context = context(&directory);
+        let path = state_files::path(directory.path(), "stop", &context.config.project, context.node);
+        let entry = |node, released| Entry {
+            origin: Origin { node: NodeAddress::new(node), incarnation: Incarnation(1) },
+            pressed: 1,
+            by: Tid::NONE,
+            reason: String::new(),
+            released,
+            released_by: Tid::NONE,
+        };
+        let read_back = |count: usize, released| {
+            let entries = (0..count as u32).map(|node| entry(node, released)).collect();
+            state_files::replace(&path, &encode(&Content { entries })).expect("the test's own directory");
+            read(&path).map(|stops| stops.map(|stops| stops.entries().count()))
+        };
+        assert_eq!(read_back(ENTRIES_MAX, 0), Ok(Some(ENTRIES_MAX)));
+        assert_eq!(read_back(ENTRIES_MAX + 1, 1), Ok(Some(0)));
+        assert!(read_back(ENTRIES_MAX + 1, 0).is_err());
     }
 
     // spec: STOP-7
