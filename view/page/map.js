@@ -1,7 +1,10 @@
-// The map: a circle of nodes, the links between them, and the number of applications on each.
+// The map: a circle of nodes, the links between them, and the applications on each: their number, and their names when
+// the pointer rests on the node.
 
 const NS = "http://www.w3.org/2000/svg";
 const WIDTH = 640;
+/** Applications of a node that are named on the map. The table has all. */
+const NAMED_MAX = 24;
 
 function svg(tag, attributes, ...children) {
   const element = document.createElementNS(NS, tag);
@@ -75,7 +78,9 @@ export function drawMap(element, state) {
     const line = svg("text", { x, y: y + 14, class: "small" });
     line.textContent = node.report ? `${stateText(node)} · ${ready}/${apps.length} apps` : stateText(node);
     const title = svg("title", {});
-    title.textContent = `${node.label} at ${node.node}: ${node.why ?? stateText(node)}`;
+    const named = apps.slice(0, NAMED_MAX).map((app) => `${app.name}: ${app.ready ? "ready" : "not ready"}`);
+    if (apps.length > NAMED_MAX) named.push(`${apps.length - NAMED_MAX} more in the table`);
+    title.textContent = [`${node.label} at ${node.node}: ${node.why ?? stateText(node)}`, ...named].join("\n");
     const box = svg("rect", { x: x - 78, y: y - 26, width: 156, height: 52, rx: 10 });
     const group = svg("g", { class: `node ${level(node)}`, "data-node": node.label }, title, box, label, line);
     parts.push(group);
