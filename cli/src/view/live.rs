@@ -33,6 +33,8 @@ const LOOKED_EVERY: Duration = Duration::from_secs(5);
 const RETRIED_EVERY: Duration = Duration::from_secs(30);
 /// Time after which a node is looked for that has ended a recording.
 const RENEWED_AFTER: Duration = Duration::from_secs(1);
+/// Maximum number of topics with a known origin: as many as the server for Foxglove offers. Others are left out.
+const ORIGINS_MAX: usize = 4_096;
 
 /// The topics that are about all messages: they have all that are shown recorded.
 const ABOUT_ALL: [&str; 2] = ["/sinew/tally", "/sinew/outcomes"];
@@ -97,13 +99,12 @@ impl Channels {
         let found = self.find(&mut system, now);
         self.entry.leave(system);
         for Expected { channel, origin } in found? {
-            match self.origins.get_mut(&channel.topic) {
+            if let Some(known) = self.origins.get_mut(&channel.topic) {
                 // The application may run on another node now. Its channel has the structure that the journal has.
-                Some(known) => *known = origin,
-                None => {
-                    self.origins.insert(channel.topic.clone(), origin);
-                    take(LiveItem::Channel(shown(channel)));
-                }
+                *known = origin;
+            } else if self.origins.len() < ORIGINS_MAX {
+                self.origins.insert(channel.topic.clone(), origin);
+                take(LiveItem::Channel(shown(channel)));
             }
         }
         Ok(())
@@ -243,6 +244,9 @@ impl Channels {
             let polled = live.poll(&mut |item| match item {
                 ViewItem::Channel(channel) => {
                     let Some(origin) = origin_of(&channel, *node, &here) else { return };
+                    if origins.len() >= ORIGINS_MAX && !origins.contains_key(&channel.topic) {
+                        return;
+                    }
                     origins.insert(channel.topic.clone(), origin);
                     take(LiveItem::Channel(shown(channel)));
                 }
