@@ -7,7 +7,8 @@
 
 use std::{
     collections::BTreeMap,
-    fs, io,
+    fs,
+    io::{self, Read as _},
     os::{fd::AsFd as _, unix::fs::DirBuilderExt as _},
     path::{Path, PathBuf},
     process::{Child, Command, ExitStatus, Stdio},
@@ -32,7 +33,7 @@ use crate::{
 /// Time between two looks at the program.
 const LOOK: Duration = Duration::from_millis(5);
 /// Maximum bytes of the lines about applications that the recording does not have.
-const DECLARED_BYTES_MAX: usize = 64 << 10;
+const DECLARED_BYTES_MAX: u64 = 64 << 10;
 
 impl From<RecordingError> for SystemError {
     fn from(error: RecordingError) -> Self {
@@ -161,8 +162,12 @@ fn unreported(order: &Order, folder: &Folder, status: ExitStatus) -> String {
 
 /// Returns the nodes of the program that have no application of the recording, in words.
 fn declared(folder: &Path) -> String {
-    let text = fs::read(folder.join(exchange::DECLARED)).unwrap_or_default();
-    let text = String::from_utf8_lossy(text.get(..DECLARED_BYTES_MAX).unwrap_or(&text)).into_owned();
+    let mut text = Vec::new();
+    if let Ok(file) = fs::File::open(folder.join(exchange::DECLARED)) {
+        // Without it, or with a part of it, the message says less.
+        let _ = file.take(DECLARED_BYTES_MAX).read_to_end(&mut text);
+    }
+    let text = String::from_utf8_lossy(&text).into_owned();
     if text.is_empty() {
         return "No node of it has asked for the recording".to_owned();
     }
