@@ -130,7 +130,7 @@ fn send_only_endpoint_gets_a_link() {
     let (mut one, mut other) = (endpoint(&node), endpoint(&node));
     let deadline = Time::now() + WATCHDOG;
     while !has_link(&other, &one) {
-        assert!(Time::now() < deadline, "waited for the link of one who only sends");
+        assert!(Time::now() < deadline, "waited for the link of an endpoint that only sends");
         one.send(other.tid(), &Counted(1)).unwrap();
         drop(other.receive(Duration::from_millis(1)).unwrap());
     }
