@@ -9,12 +9,16 @@ use std::{
     collections::BTreeMap,
     fs,
     io::{self, Read as _},
-    os::{fd::AsFd as _, unix::fs::DirBuilderExt as _},
+    os::{
+        fd::AsFd as _,
+        unix::{fs::DirBuilderExt as _, process::CommandExt as _},
+    },
     path::{Path, PathBuf},
     process::{Child, Command, ExitStatus, Stdio},
     time::Duration,
 };
 
+use rustix::process::{Pid, Signal, kill_process_group};
 use serde_json::json;
 use sinew::{
     Tid, Time,
@@ -94,6 +98,8 @@ fn run(order: &Order, folder: &Folder, until: Time, stop: &StopRequest) -> Resul
     let output = io::stderr().as_fd().try_clone_to_owned().map_err(refused)?;
     let mut command = Command::new(program);
     command.args(arguments).env(exchange::VARIABLE, &folder.0).stdin(Stdio::null()).stdout(output);
+    // The program may be the child of a script or of `cargo run`: its group is ended with it.
+    command.process_group(0);
     let mut child = Running(command.spawn().map_err(refused)?);
     loop {
         if let Some(status) = child.0.try_wait().map_err(refused)? {
@@ -113,13 +119,16 @@ fn run(order: &Order, folder: &Folder, until: Time, stop: &StopRequest) -> Resul
     }
 }
 
-/// A program that is ended with the command.
+/// A program that is ended with the command, and with it all processes of its group.
 struct Running(Child);
 
 impl Drop for Running {
     fn drop(&mut self) {
-        // Both fail only if it has ended and was waited for.
-        let _ = self.0.kill();
+        if matches!(self.0.try_wait(), Ok(None)) {
+            // It was not waited for, so the number is still that of its group. This fails only if the group has ended.
+            let _ = kill_process_group(Pid::from_child(&self.0), Signal::KILL);
+        }
+        // This fails only if it was waited for.
         let _ = self.0.wait();
     }
 }
