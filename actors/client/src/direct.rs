@@ -117,7 +117,7 @@ pub(super) struct Direct {
     cut: Option<Message>,
     /// The confirmed message that waits for its answer, if it was sent on a link.
     in_flight: Option<InFlightRequest>,
-    /// While somebody watches this application.
+    /// Present while this application is watched or recorded.
     observer: Option<Observer>,
     /// `None` if there are no links.
     accounts: Option<LinkAccounts>,

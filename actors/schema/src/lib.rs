@@ -1,8 +1,8 @@
 //! The structure of payload types.
 //!
-//! A [`Schema`] names the fields, the variants and the number types of a payload, as they are on the wire. Two programs
-//! that were built with different versions of a type can so be told what differs, and tools can decode a payload
-//! of a type that they were not built with.
+//! A [`Schema`] names the fields, the variants and the number types of a payload, as they are on the wire. So
+//! nodes can name the differences between two versions of a type, and tools can decode a payload of a type that they
+//! were not built with.
 //!
 //! This package knows no message, no node and no clock.
 

@@ -1,4 +1,4 @@
-//! What two ends with different versions of a type are told, and properties of bytes and comparisons.
+//! The differences between two versions of a type, in words, and properties of bytes and comparisons.
 
 use std::collections::BTreeMap;
 

@@ -7,13 +7,18 @@
 
 use std::{
     collections::BTreeMap,
-    fs, io,
-    os::{fd::AsFd as _, unix::fs::DirBuilderExt as _},
+    fs,
+    io::{self, Read as _},
+    os::{
+        fd::AsFd as _,
+        unix::{fs::DirBuilderExt as _, process::CommandExt as _},
+    },
     path::{Path, PathBuf},
     process::{Child, Command, ExitStatus, Stdio},
     time::Duration,
 };
 
+use rustix::process::{Pid, Signal, kill_process_group};
 use serde_json::json;
 use sinew::{
     Tid, Time,
@@ -32,7 +37,7 @@ use crate::{
 /// Time between two looks at the program.
 const LOOK: Duration = Duration::from_millis(5);
 /// Maximum bytes of the lines about applications that the recording does not have.
-const DECLARED_BYTES_MAX: usize = 64 << 10;
+const DECLARED_BYTES_MAX: u64 = 64 << 10;
 
 impl From<RecordingError> for SystemError {
     fn from(error: RecordingError) -> Self {
@@ -93,6 +98,8 @@ fn run(order: &Order, folder: &Folder, until: Time, stop: &StopRequest) -> Resul
     let output = io::stderr().as_fd().try_clone_to_owned().map_err(refused)?;
     let mut command = Command::new(program);
     command.args(arguments).env(exchange::VARIABLE, &folder.0).stdin(Stdio::null()).stdout(output);
+    // The program may be the child of a script or of `cargo run`: its group is ended with it.
+    command.process_group(0);
     let mut child = Running(command.spawn().map_err(refused)?);
     loop {
         if let Some(status) = child.0.try_wait().map_err(refused)? {
@@ -112,13 +119,16 @@ fn run(order: &Order, folder: &Folder, until: Time, stop: &StopRequest) -> Resul
     }
 }
 
-/// A program that is ended with the command.
+/// A program that is ended with the command, and with it all processes of its group.
 struct Running(Child);
 
 impl Drop for Running {
     fn drop(&mut self) {
-        // Both fail only if it has ended and was waited for.
-        let _ = self.0.kill();
+        if matches!(self.0.try_wait(), Ok(None)) {
+            // It was not waited for, so the number is still that of its group. This fails only if the group has ended.
+            let _ = kill_process_group(Pid::from_child(&self.0), Signal::KILL);
+        }
+        // This fails only if it was waited for.
         let _ = self.0.wait();
     }
 }
@@ -161,8 +171,12 @@ fn unreported(order: &Order, folder: &Folder, status: ExitStatus) -> String {
 
 /// Returns the nodes of the program that have no application of the recording, in words.
 fn declared(folder: &Path) -> String {
-    let text = fs::read(folder.join(exchange::DECLARED)).unwrap_or_default();
-    let text = String::from_utf8_lossy(text.get(..DECLARED_BYTES_MAX).unwrap_or(&text)).into_owned();
+    let mut text = Vec::new();
+    if let Ok(file) = fs::File::open(folder.join(exchange::DECLARED)) {
+        // Without it, or with a part of it, the message says less.
+        let _ = file.take(DECLARED_BYTES_MAX).read_to_end(&mut text);
+    }
+    let text = String::from_utf8_lossy(&text).into_owned();
     if text.is_empty() {
         return "No node of it has asked for the recording".to_owned();
     }

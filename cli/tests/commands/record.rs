@@ -8,7 +8,9 @@ use std::{
 };
 
 use rustix::process::Signal;
-use sinew::{AppAddress, Endpoint, NodeApi, Outcome, Payload, Registration, Tid, payload};
+use sinew::{
+    AppAddress, Endpoint, NodeApi, Outcome, Payload, Registration, Tid, client::DirectLinks, payload,
+};
 use sinew_bag::read::{Item, Reader};
 use sinew_recorder::{Recording, RecordingOptions};
 use sinew_testkit::{NodeProcess, TestDirectory, program, until};
@@ -210,6 +212,41 @@ fn program_records_its_node() {
     drop(sensor);
     assert!(summary.totals.written > 0 && summary.totals.dropped == 0, "{summary:?}");
     assert_has_the_count(&file);
+}
+
+#[test]
+fn messages_on_a_direct_link_are_recorded() {
+    // Given: two clients of a node, and a link that bypasses it
+    let scenario = Scenario::new();
+    let _knee = scenario.start("knee", 2, &[]);
+    let file = scenario.directory.join("walk.mcap");
+    let api = NodeApi::connect(scenario.socket("knee")).expect("the knee's socket");
+    let register = |name: &str| {
+        let registration = Registration::new().name(name).direct(DirectLinks::Always);
+        api.register_transport_address(registration).expect("it is registered")
+    };
+    let (mut sensor, mut drive) = (register("sensor"), register("drive"));
+    let mut exchange = || {
+        sensor.send(drive.tid(), &Count { number: 1 }).expect("it is sent");
+        let received = drive.receive(Duration::from_secs(10)).expect("the node lives");
+        assert_eq!(received.expect("the count").kind(), Count::KIND);
+    };
+    until("there is a direct link", || {
+        exchange();
+        let answer = scenario.sinew("knee", &["why", "sensor", "drive", "--json"]);
+        answer.out.contains("has a direct link to").then_some(())
+    });
+    // When: the node is recorded
+    let options = RecordingOptions { path: Some(file.clone()), ..RecordingOptions::default() };
+    let recording = Recording::begin(&api, options).expect("it begins");
+    // Then: the file has messages of the link
+    until("a message of the link is in the file", || {
+        exchange();
+        bag("info", &file).out.contains("/sensor/scenario.count").then_some(())
+    });
+    let summary = recording.finish_within(Duration::from_secs(60)).expect("it ends");
+    assert!(summary.totals.written > 0, "{summary:?}");
+    assert_complete(&file);
 }
 
 payload!("commands.client_only" => struct ClientOnly { milliamperes: u32 });

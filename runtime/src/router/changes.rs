@@ -113,6 +113,16 @@ impl Router {
         true
     }
 
+    /// Returns whether messages of some type between these two applications of this node are refused, or arrive without
+    /// their value, because the two declared that type differently.
+    #[must_use]
+    pub fn refuses_types_between(&self, one: Tid, other: Tid) -> bool {
+        let snapshot = self.snapshot.load();
+        snapshot.table.mismatches.as_ref().is_some_and(|mismatches| {
+            mismatches.refuses_some(one, other.app) || mismatches.refuses_some(other, one.app)
+        })
+    }
+
     /// Sets the tap that observes messages from now on for this purpose; `None` removes it.
     pub fn set_tap(&self, of: TapOf, tap: Option<Arc<dyn Tap>>) {
         let mut writing = lock(&self.writing);

@@ -119,6 +119,12 @@ impl Mismatches {
         Some(Self { paths, notify: self.notify.clone() })
     }
 
+    /// Returns whether messages of some type from `source` to `target` are refused, or arrive without their value.
+    pub(super) fn refuses_some(&self, source: Tid, target: AppAddress) -> bool {
+        let is_of_pair = |path: &TypedPath| path.source == source && path.target == target;
+        self.paths.iter().any(|(path, found)| is_of_pair(path) && found.effect != Effect::Counted)
+    }
+
     /// Returns whether there is no path.
     pub(super) fn is_empty(&self) -> bool {
         self.paths.is_empty()
@@ -335,6 +341,23 @@ mod tests {
         let _ = set(&router, Effect::Refused);
         router.set_peer(NodeAddress::new(3), taken);
         assert_eq!(router.deliver(message(KIND, TARGET)), Err(Rejection::Malformed));
+    }
+
+    #[test]
+    fn refused_type_is_known_for_both_directions() {
+        let (router, _) = router(&[TARGET, OTHER]);
+        let (target, other) = (Tid::new(HERE, TARGET), Tid::new(HERE, OTHER));
+        let path = TypedPath { source: other, target: TARGET, kind: KIND };
+        assert!(!router.refuses_types_between(other, target));
+        for (effect, is_refused) in
+            [(Effect::Counted, false), (Effect::Refused, true), (Effect::Spoiled, true)]
+        {
+            let table = Mismatches::new([(path, Mismatch::new(effect))], Arc::new(|| {}));
+            assert!(router.set_mismatches(Some(table), router.route_changes()));
+            assert_eq!(router.refuses_types_between(other, target), is_refused, "{effect:?}");
+            assert_eq!(router.refuses_types_between(target, other), is_refused, "{effect:?}");
+        }
+        assert!(!router.refuses_types_between(target, SOURCE));
     }
 
     #[test]

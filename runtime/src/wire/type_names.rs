@@ -1,5 +1,5 @@
 //! The payload types that this process sends or handles, by their IDs: for logs, which show names and not numbers, and
-//! for comparisons with other nodes. The structure of a type is found when somebody asks for it.
+//! for comparisons with other nodes. The structure of a type is found at the first question for it.
 
 use std::{any::TypeId, fmt, sync::OnceLock};
 

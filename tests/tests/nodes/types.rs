@@ -30,15 +30,26 @@ mod sent {
     payload!("types.counter" => pub(super) struct Counter { pub value: u32 });
     payload!("types.declared" => pub(super) struct Declared { pub torque: f32 });
     payload!("types.strict" => pub(super) struct Strict { pub torque: f32, pub until: u32 });
+    payload!("types.turn" => pub(super) struct Turn { pub angle: Degrees });
+
+    #[derive(Serialize, Deserialize)]
+    #[serde(crate = "sinew::serde")]
+    pub(super) struct Degrees(pub f32);
 }
 
-/// The same types in the knee's program: one has a field less, one has a renamed field, one has a text for a number.
+/// The same types in the knee's program: one has a field less, one has a renamed field, one has a text for a number,
+/// one has another unit.
 mod handled {
     use super::*;
     payload!("types.gains" => pub(super) struct Gains { pub kp: f32 });
     payload!("types.limit" => pub(super) struct Limit { pub newton_metres: f32 });
     payload!("types.counter" => pub(super) struct Counter { pub value: String });
     payload!("types.declared" => pub(super) struct Declared { pub newton_metres: f32 });
+    payload!("types.turn" => pub(super) struct Turn { pub angle: Radians });
+
+    #[derive(Serialize, Deserialize)]
+    #[serde(crate = "sinew::serde")]
+    pub(super) struct Radians(pub f32);
 
     /// The decoder accepts a message with one more field, and the policy does not.
     #[derive(Serialize, Deserialize)]
@@ -71,7 +82,7 @@ macro_rules! counted {
     };
 }
 
-counted!(Gains Limit Counter Declared Strict);
+counted!(Gains Limit Counter Declared Strict Turn);
 
 fn knee(handled: &Arc<AtomicU64>) -> AppSpec<Knee> {
     let handled = handled.clone();
@@ -81,6 +92,7 @@ fn knee(handled: &Arc<AtomicU64>) -> AppSpec<Knee> {
         .handles::<handled::Counter>()
         .handles::<handled::Declared>()
         .handles::<handled::Strict>()
+        .handles::<handled::Turn>()
 }
 
 /// The lines of the log about types, of all nodes of this process.
@@ -185,6 +197,34 @@ fn both_nodes_say_in_words_what_differs() {
         let question = AskSchemas { kind: Kind::named("types.limit") };
         let report: SchemasReport = ask(&sender, node, &question);
         assert_eq!(report.schemas.len(), 2, "{report:#?}");
+    }
+}
+
+#[test]
+fn other_unit_is_refused_and_named_by_both_nodes() {
+    // Given: two nodes, and a type with another unit, which the decoder accepts
+    let (loopback, handled, (gait, probe)) = (Loopback::new(), Arc::default(), sender_app("unit.gait"));
+    let hip = loopback.node("hip").app(gait).start().expect("a node");
+    let other = loopback.node("knee").app(knee(&handled)).start().expect("a node");
+    all_run(&[&hip, &other]);
+    let sender = probe.sender();
+    until("the knee is known", || sender.resolve("knee"));
+    // When: messages come until the nodes have compared the type
+    let turn = sent::Turn { angle: sent::Degrees(90.0) };
+    let malformed = Outcome::Rejected(Rejection::Malformed);
+    until("a message is refused", || (outcome(&sender, &turn) == malformed).then_some(()));
+    // Then: no further one is handled
+    let before = handled.load(Ordering::Relaxed);
+    assert_eq!(outcome(&sender, &turn), malformed);
+    assert_eq!(handled.load(Ordering::Relaxed), before);
+    // And: both nodes name the units
+    for node in [hip.handle().address(), other.handle().address()] {
+        let found = until("the node knows the difference", || {
+            let of_turn = |one: &MismatchReport| one.name.as_deref() == Some("types.turn");
+            mismatches(&sender, node).into_iter().find(of_turn)
+        });
+        assert_eq!(found.treatment, "refused");
+        assert_eq!(found.differences, ["`angle` is in Degrees at the sender and Radians at the receiver"]);
     }
 }
 

@@ -346,7 +346,7 @@ impl EstablishedLink {
         let (peer, values) = (self.peer, self.parked.len() + usize::from(self.cut().is_some()));
         if values > 0 || self.writer.has_pending() {
             let has_pending_outcomes = self.writer.has_pending();
-            sinew_runtime::log::here!(warn: %peer, values, has_pending_outcomes, "a direct link ends whose peer takes nothing; the newest values of so many kinds of Stream do not reach it");
+            sinew_runtime::log::here!(warn: %peer, values, has_pending_outcomes, "a direct link ends before its peer has read all of it: the newest values of so many types of class Stream are lost; receive more often there, or raise `direct_ring_bytes`");
         }
     }
 

@@ -1,4 +1,4 @@
-//! Reports of the messages on direct links to the node, while somebody watches this application. spec: LNCL-20
+//! Reports of the messages on direct links to the node, while this application is watched or recorded. spec: LNCL-20
 
 use std::sync::Arc;
 

@@ -6,12 +6,13 @@ mod incarnations;
 mod observed;
 mod room;
 
-use std::{thread, time::Duration};
+use std::{sync::Arc, thread, time::Duration};
 
 use serde::{Deserialize, Serialize};
 use sinew_lncl::testing::{TestNode, WATCHDOG};
 use sinew_runtime::{
     outcome::{Outcome, Rejection},
+    router::mismatches::{Effect, Mismatch, Mismatches, TypedPath},
     tid::Tid,
     time::Time,
     wire::{Class, Kind, Payload},
@@ -129,7 +130,7 @@ fn send_only_endpoint_gets_a_link() {
     let (mut one, mut other) = (endpoint(&node), endpoint(&node));
     let deadline = Time::now() + WATCHDOG;
     while !has_link(&other, &one) {
-        assert!(Time::now() < deadline, "waited for the link of one who only sends");
+        assert!(Time::now() < deadline, "waited for the link of an endpoint that only sends");
         one.send(other.tid(), &Counted(1)).unwrap();
         drop(other.receive(Duration::from_millis(1)).unwrap());
     }
@@ -251,6 +252,25 @@ fn endpoint_without_links_gets_none() {
         other.send(one.tid(), &Counted(1)).unwrap();
         drop(one.receive(WATCHDOG).unwrap().expect("a message"));
     }
+    assert!(one.direct.is_empty() && other.direct.is_empty());
+}
+
+#[test]
+fn endpoints_with_a_refused_type_get_no_link() {
+    // given: the node refuses one type from the other one, and a link would carry it
+    let node = TestNode::start();
+    let (mut one, mut other) = (endpoint(&node), endpoint(&node));
+    let path = TypedPath { source: other.tid(), target: one.tid().app, kind: Mode::KIND };
+    let table = Mismatches::new([(path, Mismatch::new(Effect::Refused))], Arc::new(|| {}));
+    assert!(node.router().set_mismatches(Some(table), node.router().route_changes()));
+    // when: each sends messages of another type
+    for _ in 0..20 {
+        one.send(other.tid(), &Counted(1)).unwrap();
+        drop(other.receive(WATCHDOG).unwrap().expect("a message"));
+        other.send(one.tid(), &Counted(1)).unwrap();
+        drop(one.receive(WATCHDOG).unwrap().expect("a message"));
+    }
+    // then
     assert!(one.direct.is_empty() && other.direct.is_empty());
 }
 

@@ -133,8 +133,12 @@ impl Client {
             let to = self.server.state.ctx.router.absolute(to);
             return self.send_outcome(to, correlation, Outcome::Rejected(Rejection::Unsupported));
         }
-        let number = lock(&self.server.state.registry).new_link();
         let to = self.server.state.ctx.router.absolute(to);
+        // A link would carry the messages that the node refuses because of their type. spec: LNCL-10
+        if self.server.state.ctx.router.refuses_types_between(self.tid, to) {
+            return self.send_outcome(to, correlation, Outcome::Rejected(Rejection::Unsupported));
+        }
+        let number = lock(&self.server.state.registry).new_link();
         let link_broker = &self.server.link_broker;
         if let Err(why) =
             link_broker.introduce(self.tid, to, LinkRequest { number, correlation }, Time::now())

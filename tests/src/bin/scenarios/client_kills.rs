@@ -21,8 +21,8 @@ use sinew_tests::clients::kills::{Plan, Verdict, run};
 
 /// Kills processes at random instants, under load, while they hold loans.
 ///
-/// The environment variable SINEW_TEST_TRANSPORT selects the transport: `socket`, `ring` (default),
-/// `direct` or `automatic`.
+/// The environment variable SINEW_TEST_TRANSPORT selects the transport: `socket`, `ring` (all through the node),
+/// `direct` or `automatic` (default).
 #[derive(Args)]
 pub(super) struct Arguments {
     /// Number of kills.

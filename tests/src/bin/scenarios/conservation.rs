@@ -14,8 +14,8 @@ use sinew_tests::clients::conservation::{Plan, run};
 
 /// Lets 8 processes with 64 addresses send each other messages while they are killed at random.
 ///
-/// The environment variable SINEW_TEST_TRANSPORT selects the transport: `socket`, `ring` (default),
-/// `direct` or `automatic`.
+/// The environment variable SINEW_TEST_TRANSPORT selects the transport: `socket`, `ring` (all through the node),
+/// `direct` or `automatic` (default).
 #[derive(Args)]
 pub(super) struct Arguments {
     /// Number of kills.

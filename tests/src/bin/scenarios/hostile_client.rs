@@ -16,8 +16,8 @@ use sinew_tests::clients::{
 
 /// Runs hostile clients against a node for the sum of the minutes and seconds, at least 5 seconds.
 ///
-/// The environment variable SINEW_TEST_TRANSPORT selects the transport of the others: `socket`, `ring`
-/// (default), `direct` or `automatic`.
+/// The environment variable SINEW_TEST_TRANSPORT selects the transport of the others: `socket`, `ring` (all
+/// through the node), `direct` or `automatic` (default).
 #[derive(Args)]
 pub(super) struct Arguments {
     /// Duration in minutes.

@@ -94,7 +94,7 @@ fn in_hand_message_is_unknown_while_peer_process_lives() {
     let sending = thread::spawn(move || one.message(to, &Counted(1)).confirmed(WATCHDOG).unwrap());
     let in_hand = other.receive(WATCHDOG).unwrap().expect("a message");
     drop(other);
-    assert_eq!(sending.join().unwrap(), Outcome::Unknown, "who has it may handle it yet");
+    assert_eq!(sending.join().unwrap(), Outcome::Unknown, "its receiver may still handle it");
     drop(in_hand);
 }
 
