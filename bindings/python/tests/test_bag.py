@@ -16,6 +16,7 @@ pandas = pytest.importorskip("pandas")
 class Angle:
     degrees: float
     joints: list  # type: ignore[type-arg]
+    age: int = 7
 
 
 @pytest.fixture
@@ -48,12 +49,13 @@ def test_recording_is_read_as_data_frames(recording: str) -> None:
     frame = walk.frame(angles)
     assert list(frame["degrees"]) == [number / 2 for number in range(10)]
     assert list(frame["joints.1"]) == [-number for number in range(10)]
+    assert list(frame["payload.age"]) == [7] * 10, "the column `age` is that of the message"
     assert frame["degrees"].dtype == float and frame.index.name == "seconds"
     assert frame.index.is_monotonic_increasing and (frame["age"] >= 0).all()
     assert str(walk.frame(angles, "time").index.dtype).startswith("datetime64[ns")
     assert list(walk.frames()[texts]["value"]) == [f"step {number}" for number in range(1, 10, 2)]
     values = [message.value for message in walk if message.topic == angles]
-    assert values[3] == {"degrees": 1.5, "joints": [3, -3]}
+    assert values[3] == {"degrees": 1.5, "joints": [3, -3], "age": 7}
     assert len(walk) >= 15 and angles in walk._repr_html_() and "messages" in repr(walk)
     with pytest.raises(KeyError, match="has no topic"):
         walk.frame("/nothing")
@@ -69,7 +71,7 @@ def test_fields_are_plotted(recording: str) -> None:
     axes = walk.plot(f"{angles}:degrees")
     assert [line.get_label() for line in axes.get_lines()] == [f"{angles}:degrees"]
     assert list(axes.get_lines()[0].get_ydata()) == [number / 2 for number in range(10)]
-    assert len(walk.plot(angles, ax=axes).get_lines()) == 4
+    assert len(walk.plot(angles, ax=axes).get_lines()) == 5
     with pytest.raises(KeyError, match="has no field"):
         walk.plot(f"{angles}:radians")
     from matplotlib import pyplot

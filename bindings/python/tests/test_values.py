@@ -5,13 +5,13 @@ from __future__ import annotations
 import dataclasses
 import enum
 import math
-from typing import Any, Dict, List, Optional, Tuple, Union
+from typing import Any, Dict, List, Optional, Set, Tuple, Union
 
 import numpy
 import pytest
 
 import sinew
-from sinew import _sinew
+from sinew import _sinew, _types
 from sinew._types import from_schema, from_wire, to_wire
 
 PLAIN = [
@@ -186,9 +186,46 @@ def test_value_that_does_not_fit_names_the_field(wire: Any, fault: str) -> None:
         from_wire(Leg, wire)
 
 
-def test_two_names_of_one_hash_are_refused() -> None:
+@dataclasses.dataclass
+class Marks:
+    marks: Set[Any]
+
+
+def test_set_of_lists_is_malformed() -> None:
+    assert from_wire(Marks, {"marks": [1, 2, 1]}) == Marks({1, 2})
+    with pytest.raises(sinew.MalformedError, match="'marks' of Marks: an element of a set"):
+        from_wire(Marks, {"marks": [[1]]})
+
+
+@pytest.mark.parametrize(
+    "wire",
+    [
+        7,
+        {},
+        {"NodeFound": 3},
+        {"NodeFound": {"node": 1}},
+        {"NodeLost": {"node": 1, "name": "knee", "why": {}}},
+        {"AppStalled": {"node": 1, "name": "knee", "silent_us": "long"}},
+    ],
+)
+def test_event_of_a_node_in_another_form_is_malformed(wire: Any) -> None:
+    with pytest.raises(sinew.MalformedError, match="event of a node"):
+        from_wire(sinew.NodeEvent, wire)
+
+
+def test_unknown_class_of_messages_is_refused() -> None:
     with pytest.raises(ValueError, match="is no class of messages"):
         sinew.payload("test.other", class_="urgent")
+
+
+def test_two_names_of_one_hash_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    for table in ("_CLASSES", "_KINDS", "_NAMES"):
+        monkeypatch.setattr(_types, table, {})
+    monkeypatch.setattr(_sinew, "kind_of", lambda name: 7)
+    one = sinew.payload("test.one")(dataclasses.make_dataclass("One", ["value"]))
+    assert _types.class_of_kind(7) is one
+    with pytest.raises(ValueError, match="hashes as 'test.one' does"):
+        sinew.payload("test.two")(dataclasses.make_dataclass("Two", ["value"]))
 
 
 STRUCT = (

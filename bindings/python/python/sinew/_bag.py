@@ -105,6 +105,7 @@ class Bag:
 
         The index is `seconds` since the recording's first message, or the `time` of the wall clock. `age` is the time
         from sending to arrival, in seconds. Fields inside a field have a point in their column: `joint.degrees`, `joints.0`.
+        A field that is called `sequence` or `age` itself is the column `payload.sequence` or `payload.age`.
         """
         import pandas
 
@@ -112,6 +113,9 @@ class Bag:
         for arrived, sent, sequence, data in found:
             row: Dict[str, Any] = {}
             _flatten("", _value(data), row)
+            for own in _OWN:
+                if own in row:
+                    row[f"payload.{own}"] = row.pop(own)
             rows.append({**row, "sequence": sequence, "age": (arrived - sent) / 1e9})
         times = [arrived for arrived, _, _, _ in found]
         if index == "time":

@@ -160,12 +160,7 @@ class Plans:
 
     def _set(self, app: Destination, order: Any, within: float) -> Plan[Applied]:
         reply = yield from self.ask(outgoing(app, "sinew.param.set", order), within)
-        wire = reply.value
-        if isinstance(wire, dict) and "Refused" in wire:
-            raise ParameterError(wire["Refused"]["why"])
-        if not isinstance(wire, dict) or "Applied" not in wire:
-            raise MalformedError("the application answered a set with an unknown outcome; update this package")
-        return Applied.of(wire["Applied"])
+        return _read(_applied, reply)
 
     # The stop of the whole system
 
@@ -213,17 +208,13 @@ class Plans:
         """Asks the own node for the structure of a type, and the node of a user that has it, if the own one has not."""
         nodes: List[int] = [Tid(self.core.tid).node]
         found: List[bytes] = []
-        for node in nodes:
+        for node in nodes:  # it grows
             message = outgoing(Tid.of(node, INSPECT), "sinew.inspect.schemas", {"kind": kind_id(name)})
-            report = (yield from self.ask(message, within)).value
-            for structure in report["schemas"]:
-                if structure["schema"] is not None:
-                    found.append(structure["schema"])
-                    continue
-                users = structure["sent_by"] + structure["handled_by"]
-                nodes.extend(user["tid"]["node"] for user in users if user["tid"]["node"] not in nodes)
-            if found or len(nodes) > NODES_ASKED_MAX:
+            found, users = _read(_schemas, (yield from self.ask(message, within)))
+            if found:
                 break
+            others = [user for user in dict.fromkeys(users) if user not in nodes]
+            nodes.extend(others[: NODES_ASKED_MAX - len(nodes)])
         if len(set(found)) > 1:
             text = f"{name!r} has {len(set(found))} structures in this system; build all programs with one, or use dicts"
             raise SinewError(text)
@@ -240,6 +231,21 @@ def _read(read: Callable[[Any], T], reply: Message) -> T:
     except (KeyError, TypeError, AttributeError) as error:
         text = f"the answer of {reply.source} has an unknown form ({error!r}); update this package or the node"
         raise MalformedError(text) from None
+
+
+def _applied(wire: Any) -> Applied:
+    """Reads the outcome of a set. Raises `ParameterError` if the application has refused it."""
+    if "Refused" in wire:
+        raise ParameterError(wire["Refused"]["why"])
+    return Applied.of(wire["Applied"])
+
+
+def _schemas(wire: Any) -> Tuple[List[bytes], List[int]]:
+    """Reads the structures of a type, and the nodes with its users if a structure is missing."""
+    found = [bytes(each["schema"]) for each in wire["schemas"] if each["schema"] is not None]
+    lacking = [each for each in wire["schemas"] if each["schema"] is None]
+    users = [user for each in lacking for user in each["sent_by"] + each["handled_by"]]
+    return found, [int(user["tid"]["node"]) for user in users]
 
 
 def _millis(seconds: float) -> int:

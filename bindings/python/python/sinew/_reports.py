@@ -222,19 +222,22 @@ class NodeEvent:
 
     @classmethod
     def __sinew_from_wire__(cls, wire: Any) -> NodeEvent:
-        if not isinstance(wire, dict) or len(wire) != 1:
-            raise MalformedError("an event of a node has an unknown form; update this package")
-        ((what, fields),) = wire.items()
-        why = fields.get("why")
-        return cls(
-            what=what,
-            node=fields["node"],
-            name=fields["name"],
-            why=next(iter(why)) if isinstance(why, dict) else why,
-            app_name=fields.get("app_name"),
-            silent=_seconds(fields.get("silent_us")),
-            details=fields,
-        )
+        try:
+            ((what, fields),) = wire.items()
+            why = fields.get("why")
+            if isinstance(why, dict):
+                (why,) = why
+            return cls(
+                what=what,
+                node=fields["node"],
+                name=fields["name"],
+                why=why,
+                app_name=fields.get("app_name"),
+                silent=_seconds(fields.get("silent_us")),
+                details=fields,
+            )
+        except (AttributeError, KeyError, TypeError, ValueError):
+            raise MalformedError("an event of a node has an unknown form; update this package") from None
 
 
 register_class(NodeEvent, PayloadType("sinew.node_event", kind_id("sinew.node_event"), 0, None))

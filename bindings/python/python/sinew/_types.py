@@ -189,7 +189,7 @@ def _make_converter(hint: Any) -> Converter:
         return _union_converter([each for each in arguments if each is not type(None)])
     if origin in (list, set, frozenset):
         element = _converter(arguments[0]) if arguments else _same
-        return lambda value: origin(element(each) for each in _expect(value, list))
+        return lambda value: _collected(origin, [element(each) for each in _expect(value, list)])
     if origin is tuple:
         return _tuple_converter(arguments)
     if origin is dict:
@@ -223,6 +223,13 @@ def _expect(value: Any, wanted: type) -> Any:
     if not isinstance(value, wanted) or (wanted is int and isinstance(value, bool)):
         raise MalformedError(f"a {wanted.__name__} is a {type(value).__name__}")
     return value
+
+
+def _collected(origin: Any, elements: List[Any]) -> Any:
+    try:
+        return elements if origin is list else origin(elements)
+    except TypeError:
+        raise MalformedError("an element of a set is a list or a map") from None
 
 
 def _union_converter(hints: List[Any]) -> Converter:
