@@ -8,12 +8,10 @@ use std::{
 };
 
 use serde_json::Value;
+use sinew_testkit::reference::GeneratedFile;
 use sinew_view::{METRICS, Shape};
 
-/// If this variable is set, the page is written instead of compared.
-const UPDATE: &str = "UPDATE";
 const COMMAND: &str = "UPDATE=1 cargo test -p sinew-view --test files";
-const MARKERS: [&str; 2] = ["<!-- generated: begin -->", "<!-- generated: end -->"];
 
 fn path(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join(name)
@@ -108,22 +106,10 @@ fn table() -> String {
 
 #[test]
 fn page_has_the_table_of_all_metrics() {
-    let name = "../docs/book/src/reference/metrics.md";
-    let page = read(name);
-    let (before, rest) = page.split_once(MARKERS[0]).expect("the generated part begins");
-    let (shown, after) = rest.split_once(MARKERS[1]).expect("the generated part ends");
+    let page = GeneratedFile::new(path("../docs/book/src/reference/metrics.md"), COMMAND);
     let table = table();
-    if std::env::var_os(UPDATE).is_some() {
-        let page = [before, MARKERS[0], "\n", &table, MARKERS[1], after].concat();
-        fs::write(path(name), page).expect("the page can be written");
-        return;
-    }
-    let differs = table.lines().zip(shown.trim_start_matches('\n').lines()).find(|(is, shown)| is != shown);
-    assert!(
-        shown == format!("\n{table}"),
-        "the table is another one, first in {differs:?}; write it anew: {COMMAND}"
-    );
-    let outside = named(&[before, after].concat());
+    page.check_part(&table);
+    let outside = named(&page.read().replace(&table, ""));
     assert!(outside.is_subset(&all()), "the page names {:?}", outside.difference(&all()));
 }
 

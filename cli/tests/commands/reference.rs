@@ -7,13 +7,10 @@ use std::{
     process::Command,
 };
 
-use sinew_testkit::program;
+use sinew_testkit::{program, reference::GeneratedFile};
 
 use crate::scenario::Answer;
 
-const MARKERS: [&str; 2] = ["<!-- generated: begin -->", "<!-- generated: end -->"];
-/// If this variable is set, the page is written instead of compared.
-const UPDATE: &str = "UPDATE";
 const COMMAND: &str = "UPDATE=1 cargo test --workspace --test commands -- reference";
 /// Columns of a block on the page.
 const WIDTH: usize = 100;
@@ -159,10 +156,8 @@ fn wrapped_line(line: &str) -> String {
 #[test]
 fn page_shows_the_help_of_each_command() {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../docs/book/src/reference/commands.md");
-    let page = std::fs::read_to_string(&path).expect("the page is there");
-    let (before, rest) = page.split_once(MARKERS[0]).expect("the generated part begins");
-    let (_, after) = rest.split_once(MARKERS[1]).expect("the generated part ends");
-    let mut expected = [before, MARKERS[0], "\n"].concat();
+    let page = GeneratedFile::new(path, COMMAND);
+    let mut expected = String::new();
     let own = PathBuf::from(env!("CARGO_BIN_EXE_sinew"));
     for (name, path) in
         [("sinew", own), ("sinew-node", program("sinew-node")), ("exoskeleton", program("exoskeleton"))]
@@ -171,13 +166,8 @@ fn page_shows_the_help_of_each_command() {
         shown.add(&[]);
         expected.push_str(&shown.page);
     }
-    expected = [&expected, "\n", MARKERS[1], after].concat();
-    if std::env::var_os(UPDATE).is_some() {
-        std::fs::write(&path, &expected).expect("the page can be written");
-        return;
-    }
-    let differs = expected.lines().zip(page.lines()).find(|(is, shown)| is != shown);
-    assert!(expected == page, "the page shows another help, first in {differs:?}; write it anew: {COMMAND}");
+    expected.push('\n');
+    page.check_part(&expected);
 }
 
 #[test]

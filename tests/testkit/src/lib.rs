@@ -18,6 +18,7 @@
 //! | `history` | the fate of each message |
 //! | `keys` | keys of a robot |
 //! | `options` | command-line options that several programs have |
+//! | `reference` | files of the documents that are generated from the code |
 //! | `report` | durations with percentiles, and the form of results |
 
 mod directory;
@@ -38,6 +39,7 @@ mod outcomes;
 pub mod preload;
 mod process;
 pub mod random;
+pub mod reference;
 #[cfg(feature = "nodes")]
 pub mod report;
 mod resources;

@@ -7,18 +7,14 @@
 use std::fmt::Write as _;
 
 use serde_json::{Map, Value, json};
+use sinew_testkit::reference::{GeneratedFile, check_cells};
 
 use super::{
     rows::{HOSTS_MAX, Kind, NODES_MAX, ROWS, Row, TEXT_BYTES_MAX, Table},
     *,
 };
 
-const MARKERS: [&str; 2] = ["<!-- generated: begin -->", "<!-- generated: end -->"];
-/// Set, the files are written instead of compared.
-const UPDATE: &str = "UPDATE";
 const COMMAND: &str = "UPDATE=1 cargo test -p sinew-cli --bins -- up::robot::reference";
-/// Longest cell of a table.
-const CELL_MAX: usize = 200;
 
 fn heading(table: Table) -> &'static str {
     match table {
@@ -118,40 +114,27 @@ pub(super) fn schema() -> Value {
     })
 }
 
-fn path(file: &str) -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("../docs/book/src/reference").join(file)
-}
-
-/// Writes `file` if an update is requested. Returns its content.
-fn updated(file: &str, text: &str) -> String {
-    if std::env::var_os(UPDATE).is_some() {
-        std::fs::write(path(file), text).unwrap_or_else(|error| panic!("{file}: {error}"));
-    }
-    std::fs::read_to_string(path(file)).unwrap_or_else(|error| panic!("{file}: {error}"))
+fn file(name: &str) -> GeneratedFile {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../docs/book/src/reference");
+    GeneratedFile::new(folder.join(name), COMMAND)
 }
 
 #[test]
 fn page_has_the_tables_of_the_code() {
-    const FILE: &str = "robot.md";
-    let page = std::fs::read_to_string(path(FILE)).expect("the page is there");
-    let (before, rest) = page.split_once(MARKERS[0]).expect("the generated part begins");
-    let (_, after) = rest.split_once(MARKERS[1]).expect("the generated part ends");
-    let expected = [before, MARKERS[0], "\n", &tables(), MARKERS[1], after].concat();
-    assert_eq!(updated(FILE, &expected), expected, "write it anew: {COMMAND}");
+    file("robot.md").check_part(&tables());
 }
 
 #[test]
 fn schema_has_the_keys_of_the_code() {
     let expected = schema();
-    let written = updated("robot.schema.json", &format!("{expected:#}\n"));
     // The order of keys is that of serde_json, which a feature of it changes.
-    let written: Value = serde_json::from_str(&written).expect("it is JSON");
-    assert!(written == expected, "write it anew: {COMMAND}");
+    let is_equal = |written: &str| serde_json::from_str::<Value>(written).expect("it is JSON") == expected;
+    file("robot.schema.json").check_by(&format!("{expected:#}\n"), is_equal);
 }
 
 #[test]
 fn complete_file_of_the_page_is_legal() {
-    let page = std::fs::read_to_string(path("robot.md")).expect("the page is there");
+    let page = file("robot.md").read();
     let (_, rest) = page.split_once("```toml\n").expect("the page has a file");
     let (file, _) = rest.split_once("```").expect("the file ends");
     Robot::from_toml(file, Path::new("/robot")).unwrap_or_else(|faults| panic!("{faults}\n{file}"));
@@ -173,12 +156,7 @@ fn file_of_the_example_robot_is_legal() {
 #[test]
 fn every_cell_is_a_short_sentence() {
     for row in ROWS {
-        for sentence in [row.effect, row.note] {
-            let words = sentence.split_whitespace().count();
-            assert!(words <= 25 && sentence.len() <= CELL_MAX, "{}, {words} words: {sentence}", row.key);
-            assert!(sentence.is_empty() || sentence.ends_with('.') && !sentence.contains('|'), "{sentence}");
-        }
-        assert!(!row.effect.is_empty(), "{}", row.key);
+        check_cells(row.key, row.effect, row.note);
     }
 }
 

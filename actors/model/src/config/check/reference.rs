@@ -83,8 +83,7 @@ const SECTIONS: [(&str, &str); 13] = [
 
 /// The section that a file may have several times.
 const COMMAND: &str = "command";
-/// Longest cell of a table, and longest line of the complete file.
-const CELL_MAX: usize = 200;
+/// Longest line of the complete file.
 const LINE_MAX: usize = 100;
 /// Four numbers with dots between them.
 const IPV4: &str = r"^[0-9]{1,3}(\.[0-9]{1,3}){3}$";

@@ -1,27 +1,15 @@
 //! Whether the reference is that of the code.
 
+use sinew_testkit::reference::{GeneratedFile, check_cells};
+
 use super::*;
 use crate::config::file::{COMMAND_KEYS, KEYS};
 
-const MARKERS: [&str; 2] = ["<!-- generated: begin -->", "<!-- generated: end -->"];
-/// Set, the files are written instead of compared.
-const UPDATE: &str = "UPDATE";
 const TO_UPDATE: &str = "UPDATE=1 cargo test --workspace --lib -- config::check::reference";
 
-fn reference(file: &str) -> std::path::PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs/book/src/reference").join(file)
-}
-
-fn read(file: &str) -> String {
-    std::fs::read_to_string(reference(file)).unwrap_or_else(|error| panic!("{file}: {error}"))
-}
-
-/// Writes `file` if an update is requested. Returns its content.
-fn updated(file: &str, text: &str) -> String {
-    if std::env::var_os(UPDATE).is_some() {
-        std::fs::write(reference(file), text).unwrap_or_else(|error| panic!("{file}: {error}"));
-    }
-    read(file)
+fn file(name: &str) -> GeneratedFile {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs/book/src/reference");
+    GeneratedFile::new(folder.join(name), TO_UPDATE)
 }
 
 /// A file with `value` for `key`, and with neighbours that allow every legal value.
@@ -109,36 +97,24 @@ fn choices_match_the_reader() {
 #[test]
 fn every_cell_is_a_short_sentence() {
     for row in ROWS.iter().chain(COMMAND_ROWS) {
-        for sentence in [row.effect, row.note] {
-            let words = sentence.split_whitespace().count();
-            assert!(words <= 25 && sentence.len() <= CELL_MAX, "{}, {words} words: {sentence}", row.key);
-            assert!(sentence.is_empty() || sentence.ends_with('.') && !sentence.contains('|'), "{sentence}");
-        }
-        assert!(!row.effect.is_empty(), "{}", row.key);
+        check_cells(row.key, row.effect, row.note);
     }
 }
 
 #[test]
 fn the_page_has_the_tables_of_the_code() {
-    const FILE: &str = "configuration.md";
-    let page = read(FILE);
-    let (before, rest) = page.split_once(MARKERS[0]).expect("the generated part begins");
-    let (_, after) = rest.split_once(MARKERS[1]).expect("the generated part ends");
-    let expected = [before, MARKERS[0], "\n", &tables(), MARKERS[1], after].concat();
-    assert_eq!(updated(FILE, &expected), expected, "write it anew: {TO_UPDATE}");
+    file("configuration.md").check_part(&tables());
 }
 
 #[test]
 fn the_complete_file_has_the_keys_of_the_code() {
-    let expected = complete_file();
-    assert_eq!(updated("node.toml", &expected), expected, "write it anew: {TO_UPDATE}");
+    file("node.toml").check(&complete_file());
 }
 
 #[test]
 fn the_schema_has_the_keys_of_the_code() {
     let expected = schema();
-    let written = updated("node.schema.json", &format!("{expected:#}\n"));
     // The order of keys is that of serde_json, which a feature of it changes.
-    let written: Value = serde_json::from_str(&written).expect("it is JSON");
-    assert!(written == expected, "write it anew: {TO_UPDATE}");
+    let is_equal = |written: &str| serde_json::from_str::<Value>(written).expect("it is JSON") == expected;
+    file("node.schema.json").check_by(&format!("{expected:#}\n"), is_equal);
 }
