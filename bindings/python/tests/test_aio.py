@@ -12,9 +12,8 @@ from typing import Any, Awaitable, Callable, List
 import pytest
 
 import sinew
+from helpers import LONG
 from sinew import Outcome, _aio, _wait
-
-LONG = 20.0
 
 
 @sinew.payload("test.aio.count")

@@ -6,15 +6,13 @@ import os
 import pathlib
 import subprocess
 import sys
-import time
 from typing import Any
 
 import pytest
 
 import sinew
+from helpers import LONG, received, running, until_gone
 from sinew import Outcome
-
-LONG = 20.0
 
 HOG = """
 import sys, sinew
@@ -33,27 +31,18 @@ POWER = 5_000_000
 
 
 def test_pause_of_the_interpreter_stalls_no_other(node: Any) -> None:
-    command = [sys.executable, "-c", HOG, node.socket, str(POWER)]
-    hog = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-    try:
-        assert hog.stdout is not None and hog.stdout.readline() == "up\n"
+    with running(HOG, node.socket, str(POWER)) as hog:
         with node.register("one") as one, node.register("other") as other:
             assert one.send_confirmed("hog", "apart.text", "go", within=LONG) is not Outcome.FAILED
             # It pauses now. Its own messages wait, and all others pass.
             assert one.send_confirmed("hog", "apart.text", "late", within=0.1) in (Outcome.UNKNOWN, Outcome.EXPIRED)
             for number in range(200):
                 one.send(other.tid, "apart.number", number)
-                message = other.receive(LONG)
-                assert message is not None and message.value == number
+                assert received(other).value == number
             assert one.resolve("hog") is not None, "it is still registered"
-            assert hog.stdout.readline() == "over\n"
+            assert hog.stdout is not None and hog.stdout.readline() == "over\n"
             assert one.send_confirmed("hog", "apart.text", "end", within=LONG) is Outcome.DELIVERED
         assert hog.wait(LONG) == 0
-    finally:
-        hog.kill()
-        hog.wait()
-        assert hog.stdout is not None
-        hog.stdout.close()
 
 
 def test_end_of_the_process_fails_the_message_in_hand(node: Any) -> None:
@@ -64,19 +53,9 @@ with sinew.register("dies", socket=sys.argv[1]) as me:
     message = me.receive(60.0)
     os._exit(1)
 """
-    process = subprocess.Popen([sys.executable, "-c", program, node.socket], stdout=subprocess.PIPE, text=True)
-    try:
-        assert process.stdout is not None and process.stdout.readline() == "up\n"
-        with node.register() as one:
-            assert one.send_confirmed("dies", "apart.text", "now", within=LONG) is Outcome.FAILED
-            until = time.monotonic() + LONG
-            while one.resolve("dies") is not None:
-                assert time.monotonic() < until, "its name is still taken"
-    finally:
-        process.kill()
-        process.wait()
-        assert process.stdout is not None
-        process.stdout.close()
+    with running(program, node.socket), node.register() as one:
+        assert one.send_confirmed("dies", "apart.text", "now", within=LONG) is Outcome.FAILED
+        until_gone(one, "dies")
 
 
 def test_socket_is_found_by_its_variable(node: Any, monkeypatch: pytest.MonkeyPatch) -> None:

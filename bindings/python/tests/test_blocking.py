@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import signal
-import threading
 import time
 from typing import Any, Callable, List
 
@@ -12,9 +10,8 @@ import numpy
 import pytest
 
 import sinew
+from helpers import LONG, in_thread, is_refused_in_a_child, received
 from sinew import Outcome
-
-LONG = 20.0
 
 
 @sinew.payload("test.angle", class_="stream")
@@ -25,12 +22,6 @@ class Angle:
 @sinew.payload("test.torque")
 class Torque:
     newton_metres: float
-
-
-def received(endpoint: sinew.Endpoint) -> sinew.Message:
-    message = endpoint.receive(LONG)
-    assert message is not None, "no message arrived"
-    return message
 
 
 def test_message_passes_with_its_value_and_age(node: Any) -> None:
@@ -65,29 +56,6 @@ def test_newest_value_of_a_stream_is_received(node: Any) -> None:
         last = received(one)
         assert last.value == Angle(9.0) and last.message_class is sinew.MessageClass.STREAM
         assert one.receive(0.0) is None
-
-
-def in_thread(work: Callable[[], Any]) -> Callable[[], Any]:
-    """Runs `work` beside the test. Returns a function that waits for its result."""
-    results: List[Any] = []
-
-    def run() -> None:
-        try:
-            results.append(work())
-        except BaseException as error:
-            results.append(error)
-
-    thread = threading.Thread(target=run)
-    thread.start()
-
-    def join() -> Any:
-        thread.join(LONG)
-        assert results, "the thread has not ended"
-        if isinstance(results[0], BaseException):
-            raise results[0]
-        return results[0]
-
-    return join
 
 
 def test_outcome_is_that_of_the_receiver(node: Any) -> None:
@@ -318,16 +286,7 @@ def test_unregistered_endpoint_is_closed(node: Any) -> None:
 
 def test_child_of_a_fork_is_refused(node: Any) -> None:
     with node.register() as one:
-        child = os.fork()
-        if child == 0:
-            try:
-                one.receive(0.0)
-            except sinew.ForkedError:
-                os._exit(42)
-            finally:
-                os._exit(1)
-        _, status = os.waitpid(child, 0)
-        assert os.waitstatus_to_exitcode(status) == 42
+        assert is_refused_in_a_child(lambda: one.receive(0.0))
         one.send(one.tid, Torque(1.0))
         assert received(one).value == Torque(1.0)
 

@@ -10,8 +10,7 @@ from typing import Any, Callable
 import pytest
 
 import sinew
-
-LONG = 20.0
+from helpers import LONG
 
 PROGRAM = """
 import os, time, sinew

@@ -6,17 +6,15 @@ import asyncio
 import dataclasses
 import enum
 import threading
-import time
 from typing import Annotated, Any, Callable, Dict, List, Optional, Tuple
 
 import pytest
 
 import sinew
+from helpers import LONG, until
 from sinew import Outcome, _sinew
 from sinew._structure import structure_of
 from sinew._types import from_schema
-
-LONG = 20.0
 
 
 class Gait(enum.Enum):
@@ -110,13 +108,6 @@ def test_structure_without_a_form_is_refused(shape: Any) -> None:
         _sinew.make_schema(nested, {})
 
 
-def until(claim: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + LONG
-    while not claim():
-        assert time.monotonic() < deadline, "it does not become true"
-        time.sleep(0.01)  # between two looks, until the deadline
-
-
 def test_node_has_the_structure_of_a_type_that_python_sends(node: Any) -> None:
     with node.register("leg", sends=[Leg], handles=[Tree, Anything, "declared.named"]) as leg:
 
@@ -125,7 +116,7 @@ def test_node_has_the_structure_of_a_type_that_python_sends(node: Any) -> None:
             asked = {"kind": _sinew.kind_of("declared.leg")}
             return leg.ask(inspect, "sinew.inspect.schemas", asked, within=LONG).value["schemas"]
 
-        until(lambda: bool(schemas()))
+        until(lambda: bool(schemas()), "the node has no structure")
         (found,) = schemas()
         assert found["schema"] == structure_of(Leg)
         assert [user["tid"]["app"] for user in found["sent_by"]] == [leg.tid.app] and found["handled_by"] == []
@@ -136,7 +127,10 @@ def test_receiver_in_rust_compares_the_type(peer: Any) -> None:
         assert me.send_confirmed("knee", Move(30.0), within=LONG) is Outcome.DELIVERED
     # 64 bits do not fit into the 32 of the receiver: refused, unless the class says the width.
     with peer.register("wide", sends=[WideAngle], requires=["knee"]) as me:
-        until(lambda: me.send_confirmed("knee", WideAngle(30.0), within=LONG) is not Outcome.DELIVERED)
+        until(
+            lambda: me.send_confirmed("knee", WideAngle(30.0), within=LONG) is not Outcome.DELIVERED,
+            "the types are not compared",
+        )
         assert me.send_confirmed("knee", WideAngle(30.0), within=LONG).is_rejected
     with peer.register("undeclared", requires=["knee"]) as me:
         assert me.send_confirmed("knee", WideAngle(30.0), within=LONG) is Outcome.DELIVERED

@@ -16,9 +16,8 @@ from typing import Any, List
 import pytest
 
 import sinew
+from helpers import LONG, in_thread, received, running, until_gone
 from sinew import Outcome
-
-LONG = 20.0
 
 
 @sinew.payload("life.number")
@@ -29,26 +28,6 @@ class Number:
 def run(program: str, socket: str, *arguments: str) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-W", "error", "-c", program, socket, *arguments]
     return subprocess.run(command, capture_output=True, text=True, timeout=LONG)
-
-
-def start(program: str, socket: str) -> subprocess.Popen[str]:
-    """Starts a program, and waits for its first line."""
-    process = subprocess.Popen([sys.executable, "-c", program, socket], stdout=subprocess.PIPE, text=True)
-    assert process.stdout is not None and process.stdout.readline() == "up\n"
-    return process
-
-
-def end(process: subprocess.Popen[str]) -> None:
-    process.kill()
-    process.wait()
-    assert process.stdout is not None
-    process.stdout.close()
-
-
-def until_gone(endpoint: sinew.Endpoint, name: str) -> None:
-    until = time.monotonic() + LONG
-    while endpoint.resolve(name) is not None:
-        assert time.monotonic() < until, f"{name} is still taken"
 
 
 LIVE = """
@@ -105,8 +84,7 @@ with sinew.register("receiver", socket=sys.argv[1]) as me:
 def test_killed_program_is_started_again_under_its_name(node: Any) -> None:
     with node.register("sender") as sender:
         for _ in range(3):
-            process = start(RECEIVER, node.socket)
-            try:
+            with running(RECEIVER, node.socket) as process:
                 assert sender.send_confirmed("receiver", Number(1), within=LONG) is Outcome.DELIVERED
                 address = sender.resolve("receiver")
                 assert address is not None
@@ -116,27 +94,16 @@ def test_killed_program_is_started_again_under_its_name(node: Any) -> None:
                 assert sender.send_confirmed(address, Number(2), within=LONG) is Outcome.REJECTED_NO_SUCH_APPLICATION
                 with pytest.raises(sinew.UnknownNameError):
                     sender.send("receiver", Number(3))
-            finally:
-                end(process)
 
 
 def test_stopped_program_takes_its_messages_when_it_continues(node: Any) -> None:
-    process = start(RECEIVER, node.socket)
-    try:
-        with node.register("sender") as sender:
-            process.send_signal(signal.SIGSTOP)
-            outcome: List[Outcome] = []
-            asked = threading.Thread(
-                target=lambda: outcome.append(sender.send_confirmed("receiver", Number(1), within=LONG))
-            )
-            asked.start()
-            with node.register("other") as other:
-                assert other.resolve("receiver") is not None, "it is registered all the same"
-            process.send_signal(signal.SIGCONT)
-            asked.join(LONG)
-            assert outcome == [Outcome.DELIVERED]
-    finally:
-        end(process)
+    with running(RECEIVER, node.socket) as process, node.register("sender") as sender:
+        process.send_signal(signal.SIGSTOP)
+        outcome = in_thread(lambda: sender.send_confirmed("receiver", Number(1), within=LONG))
+        with node.register("other") as other:
+            assert other.resolve("receiver") is not None, "it is registered all the same"
+        process.send_signal(signal.SIGCONT)
+        assert outcome() is Outcome.DELIVERED
 
 
 def test_eight_threads_each_have_an_endpoint(node: Any) -> None:
@@ -150,8 +117,7 @@ def test_eight_threads_each_have_an_endpoint(node: Any) -> None:
                 assert to is not None
                 for turn in range(turns):
                     me.send(to, Number(turn))
-                    message = me.receive(LONG)
-                    assert message is not None and message.value == Number(turn)
+                    assert received(me).value == Number(turn)
                 barrier.wait(LONG)
         except BaseException as failure:
             failures.append((own, failure))
@@ -230,14 +196,12 @@ def test_child_of_a_fork_registers_an_endpoint_of_its_own(node: Any) -> None:
         child = context.Process(target=child_of_a_fork, args=(node.socket, parent, answers))
         child.start()
         assert answers.get(timeout=LONG) == "refused"
-        message = parent.receive(LONG)
-        assert message is not None and message.value == Number(child.pid or 0)
+        assert received(parent).value == Number(child.pid or 0)
         child.join(LONG)
         assert child.exitcode == 0
         # The end of the child has closed nothing of the parent's.
         parent.send(parent.tid, Number(1))
-        again = parent.receive(LONG)
-        assert again is not None and again.value == Number(1)
+        assert received(parent).value == Number(1)
 
 
 def test_exit_of_a_forked_child_leaves_the_address_to_the_parent(node: Any) -> None:
@@ -248,20 +212,16 @@ def test_exit_of_a_forked_child_leaves_the_address_to_the_parent(node: Any) -> N
         os.waitpid(child, 0)
         assert other.resolve("parent") == parent.tid
         other.send(parent.tid, Number(2))
-        message = parent.receive(LONG)
-        assert message is not None and message.value == Number(2)
+        assert received(parent).value == Number(2)
 
 
 def test_end_of_copies_in_a_forked_child_has_no_effect(node: Any) -> None:
     endpoint, other = node.register("parent").open(), node.register().open()
     try:
         other.send(endpoint.tid, Number(1))
-        found: List[Outcome] = []
-        asked = threading.Thread(target=lambda: found.append(other.send_confirmed(endpoint.tid, Number(2), within=LONG)))
-        assert endpoint.receive(LONG) is not None
-        asked.start()
-        message = endpoint.receive(LONG)
-        assert message is not None
+        received(endpoint)
+        outcome = in_thread(lambda: other.send_confirmed(endpoint.tid, Number(2), within=LONG))
+        message = received(endpoint)
         child = os.fork()
         if child == 0:
             try:
@@ -274,10 +234,9 @@ def test_end_of_copies_in_a_forked_child_has_no_effect(node: Any) -> None:
                 os._exit(1)
         _, status = os.waitpid(child, 0)
         assert os.waitstatus_to_exitcode(status) == 42
-        assert not found, "the message is in the hand of the parent"
+        # The message is in the hand of the parent.
         message.settle(Outcome.REJECTED_BY_HANDLER)
-        asked.join(LONG)
-        assert found == [Outcome.REJECTED_BY_HANDLER]
+        assert outcome() is Outcome.REJECTED_BY_HANDLER
         assert endpoint.receive(0.05) is None and endpoint.registrations == 1
     finally:
         endpoint.close()
@@ -310,8 +269,8 @@ def test_direct_link_carries_all_that_a_node_carries(node: Any) -> None:
     with node.register("one", direct="always") as one, node.register("other", direct="always") as other:
         for turn in range(2_000):
             other.send(one.tid, Number(turn))
-            message = one.receive(LONG)
-            assert message is not None and message.value == Number(turn) and message.source == other.tid
+            message = received(one)
+            assert message.value == Number(turn) and message.source == other.tid
         # More than a ring holds: each waits for room, and arrives in order.
         blocks = 500
         sender = threading.Thread(
@@ -322,29 +281,23 @@ def test_direct_link_carries_all_that_a_node_carries(node: Any) -> None:
         )
         sender.start()
         for turn in range(blocks):
-            message = one.receive(LONG)
-            assert message is not None and message.data == bytes([turn % 256]) * 20_000
+            assert received(one).data == bytes([turn % 256]) * 20_000
         sender.join(LONG)
     with pytest.raises(ValueError, match='direct is "sometimes"'):
         node.register("one", direct="sometimes").open()
 
 
 def test_direct_link_ends_with_its_peer(node: Any) -> None:
-    process = start(ECHO, node.socket)
-    try:
-        with node.register("one", direct="always") as one:
-            to = one.resolve("echo")
-            assert to is not None
-            for turn in range(500):
-                one.send(to, Number(turn))
-                message = one.receive(LONG)
-                assert message is not None and message.value == Number(turn)
-            process.send_signal(signal.SIGKILL)
-            process.wait(LONG)
-            until_gone(one, "echo")
-            assert one.send_confirmed(to, Number(1), within=LONG) is Outcome.REJECTED_NO_SUCH_APPLICATION
-    finally:
-        end(process)
+    with running(ECHO, node.socket) as process, node.register("one", direct="always") as one:
+        to = one.resolve("echo")
+        assert to is not None
+        for turn in range(500):
+            one.send(to, Number(turn))
+            assert received(one).value == Number(turn)
+        process.send_signal(signal.SIGKILL)
+        process.wait(LONG)
+        until_gone(one, "echo")
+        assert one.send_confirmed(to, Number(1), within=LONG) is Outcome.REJECTED_NO_SUCH_APPLICATION
 
 
 async def wait_for_all(me: sinew.AsyncEndpoint, tasks: List[asyncio.Task[Any]]) -> None:

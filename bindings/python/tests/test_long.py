@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import os
-import subprocess
-import sys
 import threading
 import time
 from typing import Any, List
@@ -12,8 +10,8 @@ from typing import Any, List
 import pytest
 
 import sinew
+from helpers import LONG, received, running
 
-LONG = 20.0
 MESSAGES = 1_000_000
 BATCH = 100
 GROWTH_MAX = 4 << 20
@@ -41,8 +39,7 @@ def test_memory_is_flat_over_a_million_messages(node: Any) -> None:
             for _ in range(BATCH):
                 other.send(one.tid, leg, room_within=LONG)
             for _ in range(BATCH):
-                message = one.receive(LONG)
-                assert message is not None and message.value == leg
+                assert received(one).value == leg
             if number % (MESSAGES // BATCH // 10) == 0:
                 sizes.append(resident())
     sizes.append(resident())
@@ -79,17 +76,9 @@ def test_program_that_holds_the_gil_does_not_make_a_loop_late(peer: Any) -> None
         found = {}
         for turn in range(3):
             for way in ("beside", "member"):
-                command = [sys.executable, "-c", HOG, peer.socket, way]
-                hog = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-                try:
-                    assert hog.stdout is not None and hog.stdout.readline() == "up\n"
+                with running(HOG, peer.socket, way):
                     late = lateness(me, SECONDS)
-                    found.setdefault(way, []).append((late[len(late) // 2], late[len(late) * 95 // 100]))
-                finally:
-                    hog.kill()
-                    hog.wait()
-                    assert hog.stdout is not None
-                    hog.stdout.close()
+                found.setdefault(way, []).append((late[len(late) // 2], late[len(late) * 95 // 100]))
         half, most = (
             {way: sorted(each[index] for each in found[way])[1] for way in found} for index in (0, 1)
         )
@@ -114,8 +103,7 @@ def test_thread_that_holds_the_gil_delays_no_other_program(node: Any) -> None:
             for number in range(300):
                 for endpoint in (busy, other):
                     me.send(endpoint.tid, "long.number", number)
-                    message = endpoint.receive(LONG)
-                    assert message is not None and message.value == number
+                    assert received(endpoint).value == number
         finally:
             done.set()
             holder.join()

@@ -7,12 +7,9 @@ import threading
 import time
 from typing import Any, Callable, List
 
-import pytest
-
 import sinew
+from helpers import LONG, in_thread, received, until
 from sinew import Outcome
-
-LONG = 20.0
 
 
 @sinew.payload("outcome.short", expires_after=0.01)
@@ -31,14 +28,11 @@ def test_settled_outcome_reaches_the_sender(node: Any) -> None:
 
         def settle() -> None:
             for outcome in outcomes:
-                message = one.receive(LONG)
-                assert message is not None
-                message.settle(outcome)
+                received(one).settle(outcome)
 
-        thread = threading.Thread(target=settle)
-        thread.start()
+        done = in_thread(settle)
         assert [other.send_confirmed(one.tid, Torque(), within=LONG) for _ in outcomes] == outcomes
-        thread.join(LONG)
+        done()
 
 
 def test_message_that_waits_too_long_expires(node: Any) -> None:
@@ -56,12 +50,9 @@ def test_message_that_waits_too_long_expires(node: Any) -> None:
 
 def test_message_in_hand_at_the_deadline_is_unknown(node: Any) -> None:
     with node.register() as one, node.register() as other:
-        in_hand: List[Any] = []
-        receiver = threading.Thread(target=lambda: in_hand.append(one.receive(LONG)))
-        receiver.start()
+        in_hand = in_thread(lambda: received(one))
         assert other.send_confirmed(one.tid, Torque(), within=0.5) is Outcome.UNKNOWN
-        receiver.join(LONG)
-        assert in_hand[0].value == Torque(), "it was received"
+        assert in_hand().value == Torque(), "it was received"
 
 
 def test_queue_of_a_receiver_that_takes_nothing_is_full(node: Any) -> None:
@@ -93,18 +84,14 @@ def test_address_without_an_application_or_node_is_refused(node: Any) -> None:
 def test_loss_of_the_receiving_node_is_an_outcome(start_node: Callable[..., Any]) -> None:
     first, second = start_node("one", address="127.0.0.1"), start_node("two", address="127.0.0.2")
     with first.register("sender") as sender, second.register("receiver", reconnect=False) as receiver:
-        until = time.monotonic() + LONG
-        while sender.resolve("receiver") is None:
-            assert time.monotonic() < until, "the nodes do not find each other"
-        found: List[Outcome] = []
+        until(lambda: sender.resolve("receiver") is not None, "the nodes do not find each other")
         to = receiver.tid
         second.send_signal(signal.SIGSTOP)
-        asked = threading.Thread(target=lambda: found.append(sender.send_confirmed(to, Torque(), within=LONG)))
-        asked.start()
+        found = in_thread(lambda: sender.send_confirmed(to, Torque(), within=LONG))
         second.stop(signal.SIGKILL)
-        asked.join(LONG)
         # It was sent to a node that stood still: nothing tells whether it was handled.
-        assert found and found[0] in (Outcome.UNKNOWN, Outcome.PEER_LOST)
-        until = time.monotonic() + LONG
-        while sender.send_confirmed(to, Torque(), within=LONG) is not Outcome.REJECTED_NO_SUCH_NODE:
-            assert time.monotonic() < until, "the loss is not noticed"
+        assert found() in (Outcome.UNKNOWN, Outcome.PEER_LOST)
+        until(
+            lambda: sender.send_confirmed(to, Torque(), within=LONG) is Outcome.REJECTED_NO_SUCH_NODE,
+            "the loss is not noticed",
+        )

@@ -9,9 +9,8 @@ from typing import Any
 import pytest
 
 import sinew
+from helpers import LONG
 from sinew import Outcome, _types
-
-LONG = 20.0
 
 
 @pytest.fixture(autouse=True)

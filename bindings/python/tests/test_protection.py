@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import os
 import threading
 import time
 from typing import Any, List
@@ -11,8 +10,8 @@ from typing import Any, List
 import pytest
 
 import sinew
+from helpers import LONG, is_refused_in_a_child
 
-LONG = 20.0
 # No machine is too slow for that, and the end of the commands is noticed within a second.
 TORQUE = sinew.Protected("test.torque_command", within=1.0, age_max=4.0, good_min=3)
 
@@ -171,17 +170,12 @@ def test_child_of_a_process_with_guards_cannot_guard(node: Any) -> None:
     """The thread that makes outputs safe is not in the child."""
     with node.register() as one:
         guard = one.guard(one.tid, TORQUE, lambda _: None)
-        child = os.fork()
-        if child == 0:
-            try:
-                own = node.register().open()
-                own.guard(own.tid, TORQUE, lambda _: None)
-            except sinew.ForkedError:
-                os._exit(42)
-            finally:
-                os._exit(1)
-        _, status = os.waitpid(child, 0)
-        assert os.waitstatus_to_exitcode(status) == 42
+
+        def guard_in_the_child() -> None:
+            own = node.register().open()
+            own.guard(own.tid, TORQUE, lambda _: None)
+
+        assert is_refused_in_a_child(guard_in_the_child)
         assert not guard.is_live
 
 
