@@ -14,6 +14,7 @@ use sinew::{
 use super::{
     order::{Hash, KEYS_PREFIX, NodeOrder, PlacedFile, Port, ProgramOrder},
     plan::Wanted,
+    protocol::CONTENT_BYTES_MAX,
     robot::{NodeSpec, Program, Robot},
 };
 
@@ -74,13 +75,13 @@ impl Gathered {
 
     /// Hashes a file, and remembers its path.
     fn content(&mut self, node: &str, path: &Path) -> Option<Hash> {
-        match Hash::of_file(path) {
-            Ok((hash, _)) => {
+        match hashed(path) {
+            Ok(hash) => {
                 self.contents.insert(hash.clone(), path.to_owned());
                 Some(hash)
             }
-            Err(error) => {
-                self.fault(node, format_args!("{}: {error}; build it, or correct the path", path.display()));
+            Err(why) => {
+                self.fault(node, format_args!("{}: {why}; build it, or correct the path", path.display()));
                 None
             }
         }
@@ -194,6 +195,19 @@ impl Gathered {
             }
         }
     }
+}
+
+/// Returns the hash of a file that a host accepts.
+fn hashed(path: &Path) -> Result<Hash, String> {
+    let found = std::fs::metadata(path).map_err(|error| error.to_string())?;
+    // A device or a pipe may have no end.
+    if !found.is_file() {
+        return Err("it is no file".to_owned());
+    }
+    if found.len() > CONTENT_BYTES_MAX {
+        return Err(format!("it has {} bytes, and a file has at most 4 GiB", found.len()));
+    }
+    Hash::of_file(path).map(|(hash, _)| hash).map_err(|error| error.to_string())
 }
 
 /// Returns the ports that a configuration fixes.

@@ -18,7 +18,7 @@ use super::{
     protocol::{Answer, NodeSeen, Request},
     robot::Host,
 };
-use crate::table::{clean_lines, quoted};
+use crate::table::{clean_lines, quoted, short};
 use streams::{Streams, Written};
 
 /// Time limit for a connection and its first answer.
@@ -206,7 +206,8 @@ impl Session {
             }
             Ok(answer) => Ok(answer),
             Err(_) => {
-                Err(self.lost(&format!("it answered: {}", clean_lines(&String::from_utf8_lossy(&line)))))
+                let answer = short(String::from_utf8_lossy(&line).trim_end());
+                Err(self.lost(&format!("it answered: {answer}")))
             }
         }
     }
@@ -219,9 +220,9 @@ impl Session {
     }
 
     pub(super) fn unfit(&self, answer: &Answer) -> HostError {
-        let why = format!(
-            "it gave an answer to another request, {answer:?}; copy one version of sinew to all hosts"
-        );
+        let answer = short(&format!("{answer:?}"));
+        let why =
+            format!("it gave an answer to another request, {answer}; copy one version of sinew to all hosts");
         HostError::Refused { host: self.host.clone(), why }
     }
 }

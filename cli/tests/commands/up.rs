@@ -193,14 +193,13 @@ fn faults_of_files_are_found_before_any_change() {
     robot.copy_program();
     fs::create_dir(robot.path("keys")).expect("the test's own directory");
     let hip = robot.node("hip", 1, &[], "keys = false");
-    let knee = robot.node("knee", 2, &[], "files = [\"map.bin\"]");
+    let knee = robot.node("knee", 2, &[], "files = [\"map.bin\", \"/dev/zero\"]");
     robot.write("keys = \"keys\"", &format!("{hip}{knee}"));
     let up = robot.sinew(&["up"]);
     assert_eq!(up.code, Some(1), "{}", up.out);
     let [map, keys] = ["map.bin", "keys/nodes/knee"].map(|path| robot.path(path).display().to_string());
-    for words in
-        ["nothing was changed:", &map, &format!("knee: its keys {keys}: No such file"), "sinew keys init"]
-    {
+    let lacks = format!("knee: its keys {keys}: No such file");
+    for words in ["nothing was changed:", &map, "/dev/zero: it is no file", &lacks, "sinew keys init"] {
         assert!(up.err.contains(words), "{words}: {}", up.err);
     }
     assert!(!robot.path("state").exists());
