@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import json
+import pathlib
 import sys
 import time
-from typing import Any, Callable
+from typing import Any, Callable, Sequence
 
 import pytest
 
 import sinew
-from helpers import LONG
+from helpers import LONG, until
+from sinew import Outcome
 
 PROGRAM = """
 import os, time, sinew
@@ -26,11 +28,12 @@ with sinew.register(os.environ["SINEW_NAME"]) as me:
         elif message.is_kind("test.pause"):
             time.sleep(600)
 """
+EXAMPLE = pathlib.Path(__file__).parents[1] / "examples" / "drive.py"
 
 
-def settings(more: str = "") -> str:
+def settings(more: str = "", program: Sequence[str] = ("-c", PROGRAM)) -> str:
     """A command that runs the program with this Python."""
-    run = json.dumps([sys.executable, "-u", "-c", PROGRAM])
+    run = json.dumps([sys.executable, "-u", *program])
     return f"[[command]]\nname = 'knee.drive'\nrun = {run}\nready = 'called'\n{more}"
 
 
@@ -56,6 +59,15 @@ def test_failed_program_is_started_again(start_node: Callable[..., Any], how: st
     assert "the drive is homed" in node.log()
     why = "exit code 3" if how == "test.crash" else "has read nothing"
     assert why in node.log(), node.log()
+
+
+def test_example_is_started_and_takes_angles(start_node: Callable[..., Any]) -> None:
+    node = start_node(settings=settings("while_down = 'drop'\n", [str(EXAMPLE)]))
+    with node.register(requires=["knee.drive"]) as me:
+        angle = {"degrees": 12.5}
+        assert me.send_confirmed("knee.drive", "demo.joint_angle", angle, within=LONG) is Outcome.DELIVERED
+        until(lambda: "12.5 degrees" in node.log(), "its output is no line of the log")
+        assert me.send_confirmed("knee.drive", "demo.other", {}, within=LONG) is Outcome.REJECTED_UNKNOWN_KIND
 
 
 def test_idle_program_is_left_alone(start_node: Callable[..., Any]) -> None:
