@@ -5,6 +5,7 @@ mod real_time;
 mod secured;
 mod sockets;
 mod stop;
+mod up;
 
 use std::path::Path;
 use std::process::{Child, Command, Output};
