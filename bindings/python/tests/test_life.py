@@ -188,7 +188,6 @@ def child_of_a_fork(socket: str, parents: Any, answers: Any) -> None:
     parents.close()  # it is a copy: the address is the parent's
 
 
-@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
 def test_child_of_a_fork_registers_an_endpoint_of_its_own(node: Any) -> None:
     context = multiprocessing.get_context("fork")
     with node.register("parent") as parent:
@@ -243,7 +242,6 @@ def test_end_of_copies_in_a_forked_child_has_no_effect(node: Any) -> None:
         other.close()
 
 
-@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
 def test_end_of_a_waiting_call_in_a_forked_child_leaves_that_of_the_parent(node: Any) -> None:
     async def main() -> Any:
         async with node.register() as one, node.register() as other:

@@ -165,7 +165,6 @@ def test_guard_works_from_asyncio(node: Any) -> None:
     asyncio.run(main())
 
 
-@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
 def test_child_of_a_process_with_guards_cannot_guard(node: Any) -> None:
     """The thread that makes outputs safe is not in the child."""
     with node.register() as one:
