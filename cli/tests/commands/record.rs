@@ -233,7 +233,9 @@ fn messages_on_a_direct_link_are_recorded() {
     };
     until("there is a direct link", || {
         exchange();
-        let answer = scenario.sinew("knee", &["why", "sensor", "drive", "--json"]);
+        // Both are asked for an echo, and neither receives.
+        let words = ["why", "sensor", "drive", "--json", "--deadline-ms", "200"];
+        let answer = scenario.sinew("knee", &words);
         answer.out.contains("has a direct link to").then_some(())
     });
     // When: the node is recorded
