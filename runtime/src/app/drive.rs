@@ -456,7 +456,7 @@ mod tests {
             header.set_sent_error(None);
             header
         };
-        for header in [event, retained, Header { kind: Kind::PING, ..header }, of_unknown_age] {
+        for header in [event, retained, Header { kind: Kind::STOP_STATE, ..header }, of_unknown_age] {
             assert_eq!(age_ns(&header), None);
         }
     }
