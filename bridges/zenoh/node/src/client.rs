@@ -6,7 +6,7 @@ use std::{
 };
 
 use sinew::{
-    AsyncEndpoint, NodeApi, Registration, Tid,
+    AppAddress, AsyncEndpoint, NodeApi, Registration, Tid,
     client::{ApiError, DirectLinks, LoanedMessage, MessageBuilder, Received},
     events::{DirectoryEvent, NodeEvent, Undelivered},
     message::{Class, Kind, MemberOutcome, Outcome},
@@ -29,6 +29,8 @@ const NAMED_WITHIN: Duration = Duration::from_secs(1);
 pub struct Options {
     /// The name of the application; `None`: it has none.
     pub name: Option<String>,
+    /// A fixed address, as guards of protected commands name their sender; `None`: the node chooses one.
+    pub address: Option<AppAddress>,
     /// Names of the types that it sends or receives. The node finds collisions of their ids.
     pub types: Vec<String>,
     /// Whether it receives changes of the directory and of nodes.
@@ -78,6 +80,9 @@ impl NodeClient {
         let mut registration = Registration::new().deadline(options.within).direct(DirectLinks::Never);
         if let Some(name) = &options.name {
             registration = registration.name(name);
+        }
+        if let Some(address) = options.address {
+            registration = registration.fixed_address(address);
         }
         for name in options.types.iter().take(NAMED_MAX) {
             registration = registration.handles_named(name);
