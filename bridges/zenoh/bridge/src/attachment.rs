@@ -1,4 +1,4 @@
-//! What the bridge adds to a message for Zenoh: the header that it had in Sinew, as JSON.
+//! The attachment of a message for Zenoh: the header that it had in Sinew, as JSON.
 //!
 //! ```json
 //! {"age_error_us":12,"age_us":340,"bridge":"9f..","class":"stream","sequence":17,"source":"10.0.0.3/1001"}

@@ -117,7 +117,7 @@ impl Default for Zenoh {
     }
 }
 
-/// Whose liveliness is shown to Zenoh.
+/// The nodes and applications with a liveliness token.
 #[derive(Debug, Default, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 struct Liveness {
@@ -315,7 +315,7 @@ fn is_on_loopback(endpoint: &str) -> bool {
         .any(|start| endpoint.starts_with(start))
 }
 
-/// Returns what the file allows beyond this host without TLS, and rules that need more than the file.
+/// Returns warnings about endpoints without TLS beyond this host, and about commands of unknown age.
 fn warnings(zenoh: &Zenoh, rules: &Rules) -> Vec<String> {
     let endpoints = zenoh.connect.iter().chain(&zenoh.listen);
     let open = endpoints.filter(|endpoint| endpoint.starts_with("tcp/") && !is_on_loopback(endpoint));

@@ -17,7 +17,7 @@ use std::{fmt, fmt::Write as _};
 
 use sinew::{AppAddress, NodeAddress, Tid, message::Kind};
 
-/// Maximum length of a key in bytes that is parsed: three names, each of whose bytes is escaped, and the rest.
+/// Maximum length of a key in bytes that is parsed: three names with all bytes escaped, and the rest.
 pub const KEY_BYTES_MAX: usize = 640;
 
 /// The destination that a key names.
@@ -257,7 +257,7 @@ mod tests {
         }
 
         #[test]
-        fn any_text_is_the_key_of_its_address_or_foreign(key in "sinew/leg/[tnga]/.{0,40}") {
+        fn any_text_is_one_key_or_foreign(key in "sinew/leg/[tnga]/.{0,40}") {
             if let Some(address) = Address::parse(&key, "leg") {
                 prop_assert_eq!(address.key("leg"), key);
             }

@@ -9,7 +9,7 @@
 //! | [`payload`] | payloads on their way between both sides |
 //! | [`value`] | payloads as MessagePack and as JSON |
 //! | [`typed`] | payloads that must have the structure of their type |
-//! | [`attachment`] | what the bridge adds to a message for Zenoh |
+//! | [`attachment`] | the header of a message, which the bridge adds for Zenoh |
 //! | [`outcome`] | outcomes as replies |
 //! | [`qos`] | classes as priorities of Zenoh |
 //! | [`counts`] | counters of passed and refused messages |

@@ -6,10 +6,7 @@
 //! | of one to several | `{"members":[{"tid":"10.0.0.3/1001","outcome":"Delivered"}]}` |
 
 use serde_json::{Map, Value as Json, json};
-use sinew::{
-    Outcome,
-    message::{MemberOutcome, Rejection},
-};
+use sinew::{Outcome, message::MemberOutcome};
 
 use crate::{Encoding, Value};
 
@@ -27,7 +24,7 @@ fn object(outcome: Outcome) -> Map<String, Json> {
     object.insert("outcome".to_owned(), word.into());
     if let Outcome::Rejected(why) = outcome {
         object.insert("reason".to_owned(), format!("{why:?}").into());
-        object.insert("text".to_owned(), Rejection::to_string(&why).into());
+        object.insert("text".to_owned(), why.to_string().into());
     }
     object
 }
@@ -61,14 +58,14 @@ fn written(json: &Json, encoding: Encoding) -> Vec<u8> {
     let text = json.to_string().into_bytes();
     match encoding {
         Encoding::Json | Encoding::Raw => text,
-        // What was written as JSON is a value.
+        // Each JSON text is a value.
         Encoding::MessagePack => Value::read_json(&text).map_or(text, |value| value.written()),
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use sinew::Tid;
+    use sinew::{Tid, message::Rejection};
 
     use super::*;
 

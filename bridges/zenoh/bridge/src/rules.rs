@@ -98,7 +98,7 @@ pub struct Program {
 pub struct Arrival<'a> {
     /// Its key expression.
     pub key: &'a str,
-    /// What it is.
+    /// The act.
     pub act: Act,
     /// Bytes of its payload.
     pub length: usize,
@@ -128,7 +128,7 @@ pub struct Rules {
     by_address: BTreeMap<Address, usize>,
     by_origin: BTreeMap<(Origin, Kind), usize>,
     programs: BTreeMap<String, Program>,
-    /// Patterns of the applications whose liveliness is shown.
+    /// Patterns of the applications with a liveliness token.
     shown: Vec<String>,
     shows_nodes: bool,
 }
@@ -161,7 +161,7 @@ impl Rules {
         known.needs_token &= program.needs_token;
     }
 
-    /// Sets whose liveliness is shown: applications with a name of one of these patterns, and nodes.
+    /// Sets the liveliness tokens: of applications with a name of one of these patterns, and of nodes.
     pub fn show(&mut self, patterns: Vec<String>, nodes: bool) {
         (self.shown, self.shows_nodes) = (patterns, nodes);
     }
@@ -195,16 +195,19 @@ impl Rules {
         self.outward.iter().filter_map(|route| group_of(&route.address.target)).collect()
     }
 
-    /// Returns the index of the route of a put or a query.
+    /// Returns the index of the route of a put or a query; `None`: another bridge has sent it for Zenoh programs.
     ///
     /// # Errors
     /// It is refused, with the cause.
-    pub fn admit(&self, arrival: &Arrival<'_>, payload_max: usize) -> Result<usize, Refusal> {
-        if arrival.is_from_bridge {
-            return Err(Refusal::FromBridge);
-        }
-        let address = Address::parse(arrival.key, &self.project).ok_or(Refusal::ForeignKey)?;
-        let index = *self.by_address.get(&address).ok_or(Refusal::NoRule)?;
+    pub fn admit(&self, arrival: &Arrival<'_>, payload_max: usize) -> Result<Option<usize>, Refusal> {
+        let found = Address::parse(arrival.key, &self.project).ok_or(Refusal::ForeignKey);
+        let found = found.and_then(|address| self.by_address.get(&address).copied().ok_or(Refusal::NoRule));
+        let index = match (found, arrival.is_from_bridge) {
+            (Ok(index), false) => index,
+            (Ok(_), true) => return Err(Refusal::FromBridge),
+            (Err(_), true) => return Ok(None),
+            (Err(why), false) => return Err(why),
+        };
         let route = &self.inward[index];
         let is_allowed = match arrival.act {
             Act::Put => route.allows_put,
@@ -223,7 +226,7 @@ impl Rules {
         if route.age_max.is_some_and(|max| arrival.age.is_none_or(|age| age > max)) {
             return Err(Refusal::TooOld);
         }
-        Ok(index)
+        Ok(Some(index))
     }
 
     /// Returns the route of a message of Sinew, or `None` if no rule lets it pass.
@@ -245,7 +248,7 @@ impl Rules {
         self.shows_nodes.then(|| key::node_token(&self.project, node))
     }
 
-    /// Returns whether the liveliness of anything is shown.
+    /// Returns whether there are any liveliness tokens.
     #[must_use]
     pub fn shows_any(&self) -> bool {
         self.shows_nodes || !self.shown.is_empty()
@@ -343,18 +346,19 @@ pub(crate) mod tests {
         let rules = rules();
         let knee = put("sinew/leg/n/knee/leg.move");
         let cases = [
-            (knee, Ok(0)),
+            (knee, Ok(Some(0))),
             (Arrival { length: 1_001, ..knee }, Err(Refusal::TooLong)),
             (Arrival { is_from_bridge: true, ..knee }, Err(Refusal::FromBridge)),
             (Arrival { act: Act::Delete, ..knee }, Err(Refusal::NotThisAct)),
             (Arrival { act: Act::Get, ..knee }, Err(Refusal::NotThisAct)),
+            (Arrival { is_from_bridge: true, ..put("sinew/leg/g/telemetry/leg.angle") }, Ok(None)),
             (put("sinew/leg/n/knee/leg.stop"), Err(Refusal::NoRule)),
             (put("sinew/leg/g/knee/leg.move"), Err(Refusal::NoRule)),
             (put("sinew/leg/n/*/leg.move"), Err(Refusal::ForeignKey)),
             (put("sinew/leg/n/hip/leg.move"), Err(Refusal::NotThisAct)),
-            (Arrival { act: Act::Get, ..put("sinew/leg/n/hip/leg.move") }, Ok(2)),
+            (Arrival { act: Act::Get, ..put("sinew/leg/n/hip/leg.move") }, Ok(Some(2))),
             (put("sinew/leg/n/ankle/leg.move"), Err(Refusal::TooOld)),
-            (Arrival { age: Some(Duration::ZERO), ..put("sinew/leg/n/ankle/leg.move") }, Ok(1)),
+            (Arrival { age: Some(Duration::ZERO), ..put("sinew/leg/n/ankle/leg.move") }, Ok(Some(1))),
         ];
         for (arrival, result) in cases {
             assert_eq!(rules.admit(&arrival, 1_000), result, "{arrival:?}");

@@ -1,6 +1,6 @@
 //! Payloads that must have the structure of their type.
 //!
-//! A value becomes exactly what a Rust program sends: numbers of the type's width, fields in its order. A value that
+//! A value becomes the bytes that a Rust program sends: numbers of the type's width, fields in its order. A value that
 //! does not fit is refused, with the field. From JSON the forms of [`value`](crate::value) are accepted, too: a
 //! number as its name (`"NaN"`), bytes as `{"bytes": "0a0b"}`, keys of maps as text.
 

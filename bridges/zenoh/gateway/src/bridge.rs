@@ -30,11 +30,11 @@ use crate::{
     inlet::{Inlet, Put, Request},
     liveness::{Presence, Tokens},
     main_client::MainClient,
-    outlet::Outlet,
     programs,
     requests::{self, Requests},
     shared::Shared,
     types,
+    zenoh_sender::ZenohSender,
 };
 
 /// Maximum bytes of a message of Zenoh. A node accepts fewer, and the rest is refused and counted.
@@ -99,7 +99,7 @@ struct Clients {
     requests: Vec<NodeClient>,
 }
 
-/// What receives messages of Zenoh. It ends when it is dropped.
+/// The receivers of messages of Zenoh. They end when they are dropped.
 struct Entries {
     _subscribers: Vec<Subscriber<()>>,
     _queryables: Vec<Queryable<()>>,
@@ -122,13 +122,13 @@ pub fn run(config: Config) -> Result<(), BridgeError> {
     let node = NodeApi::connect(&config.socket)?;
     let session = open(&config)?;
     let shared = Arc::new(Shared::new(config));
-    let outlet = Outlet::start(&session, shared.config.queue)?;
+    let zenoh_sender = ZenohSender::start(&session, shared.config.queue)?;
     let tokens = Arc::new(Tokens::default());
     tokens.start(&session)?;
     let runtime = Builder::new_current_thread().enable_all().build()?;
     let clients = runtime.block_on(register(&node, &shared))?;
     let presence = Presence::new(tokens, clients.main.tid().node);
-    let to_zenoh = ToZenoh { shared: shared.clone(), outlet, bridge: session.zid().to_string() };
+    let to_zenoh = ToZenoh { shared: shared.clone(), zenoh_sender, bridge: session.zid().to_string() };
     // Here, because zenoh cannot wait on the thread of a runtime.
     let (entries, queues) = declare(&session, &to_zenoh)?;
     let local = LocalSet::new();
@@ -187,7 +187,7 @@ async fn register(node: &NodeApi, shared: &Shared) -> Result<Clients, BridgeErro
     Ok(Clients { main, types, requests })
 }
 
-/// Declares what receives messages of Zenoh.
+/// Declares the receivers of messages of Zenoh.
 fn declare(session: &Session, to_zenoh: &ToZenoh) -> Result<(Entries, Queues), BridgeError> {
     let config = &to_zenoh.shared.config;
     let (puts_in, puts) = mpsc::channel(config.queue);
@@ -196,14 +196,19 @@ fn declare(session: &Session, to_zenoh: &ToZenoh) -> Result<(Entries, Queues), B
         shared: to_zenoh.shared.clone(),
         puts: puts_in,
         requests: requests_in,
-        outlet: to_zenoh.outlet.clone(),
+        zenoh_sender: to_zenoh.zenoh_sender.clone(),
     });
     let (mut subscribers, mut queryables) = (Vec::new(), Vec::new());
     for messages in key::all_messages(config.rules.project()) {
-        let (for_puts, for_queries) = (inlet.clone(), inlet.clone());
-        let subscriber = session.declare_subscriber(messages.clone()).allowed_origin(Locality::Remote);
+        let for_puts = inlet.clone();
+        let subscriber = session.declare_subscriber(messages).allowed_origin(Locality::Remote);
         subscribers.push(subscriber.callback(move |sample| for_puts.put_received(&sample)).wait()?);
-        let queryable = session.declare_queryable(messages).allowed_origin(Locality::Remote);
+    }
+    // Only for keys with a rule: a query that another bridge answers gets no error of this one.
+    for route in config.rules.inward().iter().filter(|route| route.get.is_some()) {
+        let for_queries = inlet.clone();
+        let queryable = session.declare_queryable(route.address.key(config.rules.project()));
+        let queryable = queryable.complete(true).allowed_origin(Locality::Remote);
         queryables.push(queryable.callback(move |query| for_queries.query_received(query)).wait()?);
     }
     let (mut always, mut programs) = (Vec::new(), Vec::new());
@@ -243,7 +248,12 @@ async fn serve(
     parts.spawn_local(main.run());
     let requests: Requests = Arc::new(Mutex::new(queues.requests));
     for client in clients.requests {
-        parts.spawn_local(requests::run(shared.clone(), client, requests.clone(), to_zenoh.outlet.clone()));
+        parts.spawn_local(requests::run(
+            shared.clone(),
+            client,
+            requests.clone(),
+            to_zenoh.zenoh_sender.clone(),
+        ));
     }
     for (program, is_there) in entries.programs.clone() {
         parts.spawn_local(programs::run(node.clone(), program, to_zenoh.clone(), is_there));

@@ -12,15 +12,15 @@ use sinew_zenoh_rules::{
 };
 
 use crate::{
-    outlet::{Job, Outlet},
     shared::Shared,
+    zenoh_sender::{Job, ZenohSender},
 };
 
 /// The way to Zenoh.
 #[derive(Clone)]
 pub(crate) struct ToZenoh {
     pub(crate) shared: Arc<Shared>,
-    pub(crate) outlet: Outlet,
+    pub(crate) zenoh_sender: ZenohSender,
     /// The id of the session, by which other bridges know the origin of a message.
     pub(crate) bridge: String,
 }
@@ -52,7 +52,7 @@ impl ToZenoh {
         }
         let Prepared { route, key, payload, attachment } = self.prepare(received, origin)?;
         let put = Job::Put { key, payload, encoding: route.encoding, attachment };
-        let sent = self.outlet.send(received.class(), put);
+        let sent = self.zenoh_sender.send(received.class(), put);
         sent.map_err(|_| (Refusal::QueueFullOut, Rejection::QueueFull))?;
         self.shared.pass(Passed::PutOut);
         Ok(())

@@ -14,7 +14,7 @@ use zenoh::{
     time::Timestamp,
 };
 
-use crate::{outlet::Outlet, shared::Shared};
+use crate::{shared::Shared, zenoh_sender::ZenohSender};
 
 /// Maximum time that a timestamp may be ahead of this host's clock.
 const AHEAD_MAX: Duration = Duration::from_millis(500);
@@ -41,7 +41,7 @@ pub(crate) struct Inlet {
     pub(crate) shared: Arc<Shared>,
     pub(crate) puts: Sender<Put>,
     pub(crate) requests: Sender<Request>,
-    pub(crate) outlet: Outlet,
+    pub(crate) zenoh_sender: ZenohSender,
 }
 
 impl Inlet {
@@ -59,8 +59,9 @@ impl Inlet {
             is_from_bridge: is_from_bridge(sample.attachment()),
         };
         let refused = match self.shared.config.rules.admit(&arrival, self.shared.payload_max()) {
+            Ok(None) => return,
             Err(why) => why,
-            Ok(route) => {
+            Ok(Some(route)) => {
                 let payload = sample.payload().to_bytes().into_owned();
                 let put = Put { route, payload, arrived: Instant::now() };
                 if self.puts.try_send(put).is_ok() {
@@ -85,8 +86,9 @@ impl Inlet {
         };
         let (why, query, encoding) = match self.shared.config.rules.admit(&arrival, self.shared.payload_max())
         {
+            Ok(None) => return,
             Err(why) => (why, query, Encoding::Json),
-            Ok(route) => {
+            Ok(Some(route)) => {
                 let payload = payload.to_bytes().into_owned();
                 let request = Request { route, payload, arrived: Instant::now(), query };
                 match self.requests.try_send(request) {
@@ -101,7 +103,7 @@ impl Inlet {
         };
         self.shared.refuse(why, &key, "");
         let error = outcome::error(&why.to_string(), None, encoding);
-        self.outlet.reply(query, Err(error), encoding);
+        self.zenoh_sender.reply(query, Err(error), encoding);
     }
 }
 

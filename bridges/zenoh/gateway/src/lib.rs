@@ -4,14 +4,14 @@
 //!  Zenoh's threads          queues with a bound           one thread of tokio
 //!  puts        --------------> puts ------------------> main client ----> node
 //!  queries     --------------> requests ---------------> clients for requests
-//!              <-- a thread for each class <- outlet <-- main client, programs
+//!              <-- a thread for each class <- zenoh_sender <-- main client, programs
 //! ```
 //!
 //! | module | content |
 //! | --- | --- |
 //! | [`bridge`] | start, run, end |
 //! | `inlet` | puts and queries of Zenoh, as they arrive |
-//! | `outlet` | puts, queries and replies to Zenoh |
+//! | `zenoh_sender` | puts, queries and replies to Zenoh |
 //! | `forward` | a message of Sinew as a put or a query |
 //! | `main_client` | groups and broadcasts of Sinew; unconfirmed and protected messages into Sinew |
 //! | `requests` | requests and confirmed messages into Sinew |
@@ -27,8 +27,8 @@ mod forward;
 mod inlet;
 mod liveness;
 mod main_client;
-mod outlet;
 mod programs;
 mod requests;
 mod shared;
 mod types;
+mod zenoh_sender;

@@ -1,4 +1,4 @@
-//! Liveliness tokens of nodes and applications. A thread declares what is wanted, and nothing else.
+//! Liveliness tokens of nodes and applications. A thread declares those that are wanted, and removes the others.
 
 use std::{
     collections::{BTreeMap, BTreeSet},

@@ -1,4 +1,5 @@
-//! The names of Zenoh programs at the node: each is a client of its own, whose messages become puts and queries.
+//! The names of Zenoh programs at the node: each is a client of its own. Messages to it become puts and
+//! queries.
 
 use std::{collections::BTreeMap, time::Duration};
 
@@ -21,7 +22,7 @@ use tracing::{info, warn};
 
 use crate::{
     forward::{Prepared, ToZenoh, ignore},
-    outlet::{Answer, Get, Job, Pending},
+    zenoh_sender::{Answer, Get, Job, Pending},
 };
 
 /// Maximum number of requests to a program that wait for their replies.
@@ -143,7 +144,9 @@ impl Registered<'_> {
         self.next += 1;
         let answer = Pending { number, to: Some(self.answers.clone()) };
         let get = Get { key, payload, encoding, attachment, within: route.within, answer };
-        if let Err(Job::Get(mut get)) = self.to_zenoh.outlet.send(Class::Control, Job::Get(Box::new(get))) {
+        if let Err(Job::Get(mut get)) =
+            self.to_zenoh.zenoh_sender.send(Class::Control, Job::Get(Box::new(get)))
+        {
             get.answer.to = None;
             return Err((Refusal::QueueFullOut, Rejection::QueueFull, received));
         }

@@ -16,8 +16,8 @@ use crate::{
     forward::ignore,
     inlet::Request,
     main_client::payload_for,
-    outlet::Outlet,
     shared::{Shared, destination},
+    zenoh_sender::ZenohSender,
 };
 
 /// The queue of requests, which the clients share.
@@ -31,7 +31,7 @@ pub(crate) async fn run(
     shared: Arc<Shared>,
     mut client: NodeClient,
     requests: Requests,
-    outlet: Outlet,
+    zenoh_sender: ZenohSender,
 ) -> ApiError {
     loop {
         shared.note_own(client.tid());
@@ -42,12 +42,12 @@ pub(crate) async fn run(
                 Err(why @ ApiError::Disconnected(_)) => debug!("{why}"),
                 Err(why) => return why,
             },
-            Some(request) = next => answer(&shared, &mut client, request, &outlet).await,
+            Some(request) = next => answer(&shared, &mut client, request, &zenoh_sender).await,
         }
     }
 }
 
-async fn answer(shared: &Shared, client: &mut NodeClient, request: Request, outlet: &Outlet) {
+async fn answer(shared: &Shared, client: &mut NodeClient, request: Request, zenoh_sender: &ZenohSender) {
     let route = &shared.config.rules.inward()[request.route];
     let result = match try_answer(shared, client, &request, route).await {
         Ok(reply) => Ok(reply),
@@ -57,7 +57,7 @@ async fn answer(shared: &Shared, client: &mut NodeClient, request: Request, outl
             Err(outcome::error(&text, outcome, route.encoding))
         }
     };
-    if !outlet.reply(request.query, result, route.encoding) {
+    if !zenoh_sender.reply(request.query, result, route.encoding) {
         shared.refuse(Refusal::QueueFullOut, "a reply", "");
     }
 }

@@ -17,7 +17,7 @@ use crate::seen::Seen;
 
 /// Maximum number of types that a registration names. Further ones are sent and received all the same.
 const NAMED_MAX: usize = 64;
-/// Maximum number of names whose addresses are kept. At more names all are looked up again.
+/// Maximum number of names with a kept address. At more names all are looked up again.
 const ADDRESSES_MAX: usize = 1_024;
 /// Time after which the address of a name is looked up again, if no change of the directory came before.
 const ADDRESS_KEPT: Duration = Duration::from_millis(500);

@@ -1,13 +1,13 @@
 //! A client of one node for bridges to other systems. It knows no other system.
 //!
 //! A [`NodeClient`] is an application in a process of its own, as any other: it has an address, a name if it wants
-//! one, and the rights that the access list gives to that name. It sends and receives payloads whose types it knows
-//! by name only, as bytes.
+//! one, and the rights that the access list gives to that name. It sends and receives payloads as bytes, and knows
+//! their types by name only.
 //!
 //! | module | content |
 //! | --- | --- |
 //! | [`client`] | registration, messages, outcomes, replies |
-//! | [`seen`] | what a client receives: messages, changes of the directory and of nodes |
+//! | [`seen`] | received messages, and changes of the directory and of nodes |
 //! | [`types`] | the structure of a type, and which types are protected |
 
 pub mod client;

@@ -1,4 +1,4 @@
-//! What a client receives.
+//! The messages and events that a client receives.
 
 use sinew::{
     Payload as _,

@@ -130,7 +130,7 @@ fn each_fault_is_reported_with_its_place() {
 }
 
 #[test]
-fn open_endpoints_and_commands_of_unknown_age_are_warned_of() {
+fn open_endpoints_and_commands_without_age_have_warnings() {
     let open = rules("[zenoh]\nconnect = [\"tcp/192.0.2.7:7447\", \"tls/192.0.2.7:7447\"]\n");
     assert!(
         open.warnings.len() == 1 && open.warnings[0].starts_with("tcp/192.0.2.7:7447"),

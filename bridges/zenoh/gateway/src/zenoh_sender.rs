@@ -74,11 +74,11 @@ impl Drop for Pending {
 
 /// The queues to Zenoh.
 #[derive(Clone)]
-pub(crate) struct Outlet {
+pub(crate) struct ZenohSender {
     queues: [SyncSender<Job>; 3],
 }
 
-impl Outlet {
+impl ZenohSender {
     /// Starts the threads.
     pub(crate) fn start(session: &Session, room: usize) -> io::Result<Self> {
         let start = |class: Class| {
