@@ -108,7 +108,10 @@ impl Shared {
     }
 
     pub(crate) fn set_protected(&self, protected: ProtectedTypes) {
-        *lock(&self.protected) = protected;
+        let former = std::mem::replace(&mut *lock(&self.protected), protected.clone());
+        for name in protected.names.difference(&former.names) {
+            info!("{name} is a protected type: it passes only by a rule with `protected`");
+        }
     }
 
     pub(crate) fn is_protected(&self, payload_type: &str) -> bool {

@@ -22,7 +22,7 @@ use zenoh::{
     Session, Wait,
     key_expr::KeyExpr,
     qos::{CongestionControl, Priority, Reliability},
-    query::{Query, Reply},
+    query::{ConsolidationMode, Query, Reply},
     sample::Locality,
 };
 
@@ -148,7 +148,9 @@ fn ask(session: &Session, qos: Qos, get: Get) -> zenoh::Result<()> {
         session.get(KeyExpr::try_from(get.key)?).payload(get.payload).encoding(encoding_of(get.encoding));
     let query = query.attachment(get.attachment).allowed_destination(Locality::Remote).timeout(get.within);
     let query = query.priority(priority(qos.priority)).congestion_control(congestion(qos));
-    query.express(qos.is_express).callback(callback).wait()
+    // The first reply counts. Otherwise zenoh keeps it until all programs have answered.
+    let query = query.express(qos.is_express).consolidation(ConsolidationMode::None);
+    query.callback(callback).wait()
 }
 
 fn answer_of(reply: &Reply) -> Result<Vec<u8>, String> {

@@ -43,7 +43,8 @@ fn protected_commands_pass_only_through_the_protected_sender() {
         stage.robot.wait_for(&["torque 2.5"]);
         is_over.store(true, Ordering::Relaxed);
     });
-    // The type is guarded at the node, and the rule has no protected sender.
+    stage.bridge.wait_for(&["robot.torque is a protected type"]);
+    // The rule has no protected sender.
     session.put(&other, r#"{"newton_metres":9}"#).wait().expect("a session");
     stage.wait_for_count("unprotected", 1);
     assert!(!stage.robot.output().iter().any(|line| line == "torque 9"));
