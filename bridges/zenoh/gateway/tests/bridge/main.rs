@@ -9,6 +9,7 @@
 //! The test with the Zenoh of PyPI uses `SINEW_PYTHON`, or `python3`.
 
 mod access;
+mod command;
 mod liveness;
 mod passing;
 mod protection;
