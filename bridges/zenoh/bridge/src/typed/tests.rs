@@ -141,7 +141,8 @@ proptest! {
         let json = Value::read(&bytes).expect("a payload").json();
         let value = Value::read_json(json.as_bytes()).expect("JSON");
         let passed = fitted(value, &schema(), Form::Json).expect("it fits").written();
-        prop_assert_eq!(&passed, &bytes);
+        // JSON has its keys in another order, and so has the map.
+        prop_assert_eq!(rmp_serde::from_slice::<Report>(&passed).expect("a report"), report);
         let again = Value::read(&bytes).expect("a payload");
         prop_assert_eq!(fitted(again, &schema(), Form::MessagePack).expect("it fits").written(), bytes);
     }
