@@ -49,6 +49,25 @@ pub enum Role<'a> {
         /// Endpoints of other routers.
         connect: &'a [String],
     },
+    /// A bridge for programs that speak Zenoh: a client of one router at a time, or a peer.
+    Bridge(Bridge<'a>),
+}
+
+/// The settings of a bridge's session.
+#[derive(Clone, Copy, Debug)]
+pub struct Bridge<'a> {
+    /// Whether it is a peer. A client waits until a router accepts it.
+    pub is_peer: bool,
+    /// Own endpoints.
+    pub listen: &'a [String],
+    /// Endpoints of routers and peers.
+    pub connect: &'a [String],
+    /// Whether peers are searched for by multicast.
+    pub scouting: bool,
+    /// The keys of `transport/link/tls`, and the paths of PEM files.
+    pub certificates: &'a [(&'a str, &'a str)],
+    /// Maximum bytes of a received message.
+    pub message_max: u32,
 }
 
 /// Opens a session.
@@ -60,6 +79,7 @@ pub fn open(role: Role<'_>, lease: Duration) -> Result<Session, SessionError> {
     let mut insert = |key: &str, value: String| {
         config.insert_json5(key, &value).map_err(|error| SessionError(format!("{key} = {value}: {error}")))
     };
+    let (mut scouting, mut message_max) = (false, MESSAGE_MAX);
     let (mode, listen, connect) = match role {
         Role::Client { routers, tls } => {
             let files = [
@@ -75,6 +95,18 @@ pub fn open(role: Role<'_>, lease: Duration) -> Result<Session, SessionError> {
             ("client", &[][..], routers)
         }
         Role::Router { listen, connect } => ("router", listen, connect),
+        Role::Bridge(bridge) => {
+            for (key, path) in bridge.certificates {
+                insert(&format!("transport/link/tls/{key}"), text(path))?;
+            }
+            let has = |wanted: &str| bridge.certificates.iter().any(|(key, _)| *key == wanted);
+            // A listener with an authority of its own admits certificates of that authority alone.
+            let mutual =
+                has("connect_certificate") || has("listen_certificate") && has("root_ca_certificate");
+            insert("transport/link/tls/enable_mtls", mutual.to_string())?;
+            (scouting, message_max) = (bridge.scouting, bridge.message_max);
+            (if bridge.is_peer { "peer" } else { "client" }, bridge.listen, bridge.connect)
+        }
     };
     insert("mode", text(mode))?;
     insert("listen/endpoints", list(listen))?;
@@ -85,11 +117,11 @@ pub fn open(role: Role<'_>, lease: Duration) -> Result<Session, SessionError> {
         "{{ period_init_ms: {RETRY_FIRST_MS}, period_max_ms: {RETRY_LONGEST_MS}, period_increase_factor: 2 }}"
     );
     insert("connect/retry", retry)?;
-    insert("scouting/multicast/enabled", "false".to_owned())?;
+    insert("scouting/multicast/enabled", scouting.to_string())?;
     insert("scouting/gossip/enabled", "false".to_owned())?;
     insert("transport/link/tx/lease", lease.as_millis().to_string())?;
     insert("transport/link/tx/keep_alive", KEEP_ALIVES.to_string())?;
-    insert("transport/link/rx/max_message_size", MESSAGE_MAX.to_string())?;
+    insert("transport/link/rx/max_message_size", message_max.to_string())?;
     Ok(zenoh::open(config).wait()?)
 }
 
