@@ -35,7 +35,8 @@ mod tests {
     fn rate_is_limited_and_late_messages_are_made_up() {
         let ms = Duration::from_millis;
         let mut pace = Pace::new(ms(10));
-        let passed = |pace: &mut Pace, step| (0..1_000).filter(|at| pace.take(ms(at * step))).count();
+        let passed =
+            |pace: &mut Pace, step: u64| (0..1_000_u64).filter(|at| pace.take(ms(at * step))).count();
         // 1,000 a second for a second.
         assert_eq!(passed(&mut pace, 1), 101);
         let mut pace = Pace::new(ms(10));
