@@ -90,15 +90,6 @@ impl NodeClient {
         if options.has_events {
             registration = registration.subscribe::<NodeEvent>().subscribe::<DirectoryEvent>();
         }
-        Self::register_as(node, registration).await
-    }
-
-    /// Registers at a node with settings of the bridge's own, such as a fixed address for receivers that guard its
-    /// commands.
-    ///
-    /// # Errors
-    /// The node refused, or did not answer in time.
-    pub async fn register_as(node: &NodeApi, registration: Registration) -> Result<Self, ApiError> {
         let endpoint = node.register_transport_address_async(registration).await?;
         Ok(Self { endpoint, addresses: BTreeMap::new() })
     }

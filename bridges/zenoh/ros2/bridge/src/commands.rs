@@ -3,15 +3,15 @@
 use std::{collections::BTreeSet, path::PathBuf, sync::Arc, time::Duration};
 
 use sinew::{
-    AppAddress, Class, NodeApi, Registration, Tid,
-    client::{ApiError, DirectLinks},
+    AppAddress, Class, NodeApi, Tid,
+    client::ApiError,
     message::Kind,
     protection::{
         Protection,
         raw::{Protected, Reads},
     },
 };
-use sinew_bridge_node::{Destination, NodeClient, Outgoing};
+use sinew_bridge_node::{Destination, NodeClient, Options, Outgoing};
 use sinew_ros2_core::{
     Cause, EndpointKind, GraphNode, Incoming, Receiver, Refusal, SealLimits, SendClass, topic_key, type_hash,
 };
@@ -121,18 +121,15 @@ impl Commands {
 
     async fn register(&self, socket: &PathBuf) -> Result<NodeClient, ApiError> {
         let node = NodeApi::connect(socket)?;
-        let mut registration = Registration::new()
-            .name(&self.name)
-            .deadline(REGISTERED_WITHIN)
-            // A guard sends its echoes through the node, which can stop them.
-            .direct(DirectLinks::Never);
-        if let Some(address) = self.address {
-            registration = registration.fixed_address(AppAddress::new(address));
-        }
-        for route in &self.routes {
-            registration = registration.handles_named(&route.type_name);
-        }
-        let client = NodeClient::register_as(&node, registration).await?;
+        // Without direct links: a guard sends its echoes through the node, which can stop them.
+        let options = Options {
+            name: Some(self.name.clone()),
+            address: self.address.map(AppAddress::new),
+            types: self.routes.iter().map(|route| route.type_name.clone()).collect(),
+            has_events: false,
+            within: REGISTERED_WITHIN,
+        };
+        let client = NodeClient::register(&node, &options).await?;
         info!("sends commands as {} ({}) of node {}", self.name, client.tid(), client.node_name());
         Ok(client)
     }
