@@ -50,7 +50,7 @@ fn graph_shows_nodes_topics_and_services() {
             );
             seen.insert(format!("{}: {of}", token.node));
         }
-        (seen.len() >= 15).then_some(seen)
+        (seen.len() >= 14).then_some(seen)
     });
     let kind = EndpointKind::Publisher;
     for line in [
