@@ -10,6 +10,10 @@ pub(crate) fn now() -> Duration {
 }
 
 /// Returns the wall clock of the host, in nanoseconds.
+#[expect(
+    clippy::disallowed_methods,
+    reason = "ROS 2 stamps messages with the wall clock, and no wait depends on it"
+)]
 pub(crate) fn wall_ns() -> i64 {
     let since = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
     i64::try_from(since.as_nanos()).unwrap_or(i64::MAX)

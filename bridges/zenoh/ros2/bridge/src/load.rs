@@ -64,7 +64,7 @@ pub fn load(path: &Path) -> Result<Loaded, LoadError> {
     let file = MappingFile::parse(&read(path, FILE_BYTES_MAX).map_err(one)?).map_err(one)?;
     let mut catalog = Catalog::shipped();
     if let Some(folder) = file.messages() {
-        let folder = path.parent().unwrap_or(Path::new(".")).join(folder);
+        let folder = path.parent().unwrap_or_else(|| Path::new(".")).join(folder);
         add_folder(&mut catalog, &folder).map_err(one)?;
     }
     let services = Services::of(&catalog).map_err(one)?;

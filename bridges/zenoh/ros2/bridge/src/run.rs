@@ -33,6 +33,9 @@ const LEASE: Duration = Duration::from_secs(2);
 const PARAMETERS_QUEUED: usize = 32;
 const STOPS_QUEUED: usize = 8;
 
+/// Ends of threads that wait to be reported: one ends the bridge.
+const ENDS: usize = 8;
+
 /// Why the bridge has ended.
 #[derive(Debug)]
 pub struct RunError(String);
@@ -63,20 +66,20 @@ pub fn run(loaded: Loaded) -> RunError {
 
 /// The threads: the first one that ends ends the bridge.
 struct Threads {
-    ended: mpsc::Sender<String>,
+    ended: mpsc::SyncSender<String>,
 }
 
 /// Reports the end of a thread, also after a panic.
 struct Ended {
     name: &'static str,
     why: String,
-    ended: mpsc::Sender<String>,
+    ended: mpsc::SyncSender<String>,
 }
 
 impl Drop for Ended {
     fn drop(&mut self) {
-        // At the end of the process nobody waits.
-        let _ = self.ended.send(format!("the part `{}` has ended: {}", self.name, self.why));
+        // The first one is enough.
+        let _ = self.ended.try_send(format!("the part `{}` has ended: {}", self.name, self.why));
     }
 }
 
@@ -110,7 +113,7 @@ fn start(loaded: Loaded) -> Result<(mpsc::Receiver<String>, Arc<Graph>), String>
     let node = graph.node(&mapping.namespace, &mapping.node)?;
     info!("is {node} in domain {}", mapping.domain);
     let counts = Counts::default();
-    let (ended, ends) = mpsc::channel();
+    let (ended, ends) = mpsc::sync_channel(ENDS);
     let threads = Threads { ended };
     start_stop(&mapping, (&graph, &node), &services.trigger, (&threads, &counts))?;
     start_parameters(&mapping, &graph, &services, (&threads, &counts))?;

@@ -124,8 +124,8 @@ impl Topics {
         let payload = unsealed(seen.payload).map_or(seen.payload, |unsealed| unsealed.payload);
         let at = Duration::from_nanos(seen.at.as_nanos());
         for Topic { rule, kinds, .. } in &mut self.all {
-            for input in 0..kinds.len() {
-                if kinds[input] != seen.header.kind || rule.inputs[input].app != app {
+            for (input, kind) in kinds.iter().enumerate() {
+                if *kind != seen.header.kind || rule.inputs[input].app != app {
                     continue;
                 }
                 if let Err(why) = rule.take(input, payload, at) {

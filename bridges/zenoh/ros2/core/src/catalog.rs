@@ -211,9 +211,12 @@ impl Catalog {
     pub fn service(&self, name: &str) -> Result<Service, CatalogError> {
         let name = TypeName::parse(name)?;
         let half = |suffix| self.message(name.with_suffix(suffix).as_str());
-        let unknown = |why| match why {
-            CatalogError::Unknown { by: None, .. } => CatalogError::Unknown { name: name.clone(), by: None },
-            other => other,
+        let unknown = |why: CatalogError| {
+            if matches!(why, CatalogError::Unknown { by: None, .. }) {
+                CatalogError::Unknown { name: name.clone(), by: None }
+            } else {
+                why
+            }
         };
         let (request, response) = (half("_Request").map_err(unknown)?, half("_Response").map_err(unknown)?);
         let info = self.message("service_msgs/msg/ServiceEventInfo")?;

@@ -44,7 +44,13 @@ pub(crate) fn to_ros(target: &Target, payload: &Payload, by: &Expression) -> Res
             let one = |byte: &u8| one_to_ros(&target.element, &Payload::Integer((*byte).into()), by);
             bytes.iter().map(one).collect::<Result<_, _>>()?
         }
-        other => return Err(misfit("a list", other)),
+        Payload::Nil
+        | Payload::Bool(_)
+        | Payload::Integer(_)
+        | Payload::Unsigned(_)
+        | Payload::Float(_)
+        | Payload::Text(_)
+        | Payload::Map(_) => return Err(misfit("a list", payload)),
     };
     let has_room = match target.count {
         Count::Array(length) => values.len() == length as usize,
@@ -94,19 +100,26 @@ fn unsigned(bits: u8, number: &Payload, by: &Expression) -> Result<Value, Conver
 /// Returns a whole number: the same one, or, with a factor, the nearest one to the result.
 fn whole(payload: &Payload, by: &Expression) -> Result<i128, ConvertError> {
     match payload {
-        Payload::Integer(number) if by.is_plain() => Ok((*number).into()),
-        Payload::Unsigned(number) if by.is_plain() => Ok((*number).into()),
-        other => {
-            let number = other.number().ok_or_else(|| misfit("a whole number", other))?;
-            let result = by.apply(number);
-            let rounded = if by.is_plain() { result } else { result.round() };
-            // The conversion saturates, and both ends are beyond every integer of ROS.
-            if rounded.is_finite() && rounded.fract() == 0.0 {
-                Ok(rounded as i128)
-            } else {
-                Err(ConvertError(format!("{result} is no whole number")))
-            }
-        }
+        Payload::Integer(number) if by.is_plain() => return Ok((*number).into()),
+        Payload::Unsigned(number) if by.is_plain() => return Ok((*number).into()),
+        Payload::Nil
+        | Payload::Bool(_)
+        | Payload::Integer(_)
+        | Payload::Unsigned(_)
+        | Payload::Float(_)
+        | Payload::Text(_)
+        | Payload::Bytes(_)
+        | Payload::List(_)
+        | Payload::Map(_) => {}
+    }
+    let number = payload.number().ok_or_else(|| misfit("a whole number", payload))?;
+    let result = by.apply(number);
+    let rounded = if by.is_plain() { result } else { result.round() };
+    // The conversion saturates, and both ends are beyond every integer of ROS.
+    if rounded.is_finite() && rounded.fract() == 0.0 {
+        Ok(rounded as i128)
+    } else {
+        Err(ConvertError(format!("{result} is no whole number")))
     }
 }
 

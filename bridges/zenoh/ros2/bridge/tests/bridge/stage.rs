@@ -252,6 +252,7 @@ impl Peer {
         topic_key(7, topic, &of.name, &type_hash(&of))
     }
 
+    #[expect(clippy::disallowed_methods, reason = "ROS 2 stamps messages with the wall clock")]
     fn attachment(&self) -> Attachment {
         let mut sequence = self.sequence.lock().expect("no panic");
         *sequence += 1;
@@ -266,13 +267,13 @@ impl Peer {
         topic: &str,
         of: &str,
     ) -> (Subscriber<()>, mpsc::Receiver<(Value, Attachment)>) {
-        let (put, taken) = mpsc::channel();
+        let (put, taken) = mpsc::sync_channel(4_096);
         let message = self.catalog.message(of).expect("a type");
         let take = move |sample: zenoh::sample::Sample| {
             let value = decode(&message, &sample.payload().to_bytes()).expect("a message");
             let attachment = sample.attachment().expect("an attachment").to_bytes();
             // The test may have ended.
-            let _ = put.send((value, Attachment::parse(&attachment).expect("an attachment")));
+            let _ = put.try_send((value, Attachment::parse(&attachment).expect("an attachment")));
         };
         let declared = self.session.declare_subscriber(self.key(topic, of)).callback(take).wait();
         (declared.expect("a subscription"), taken)
