@@ -109,16 +109,21 @@ fn obey(operator: &Sender, view: &View) {
                 let value = view.value.load(Ordering::SeqCst);
                 println!("{value} {}", view.since_ns.load(Ordering::SeqCst));
             }
-            ["set", value, lead_ms, within_ms] => set(operator, value, [lead_ms, within_ms]),
+            ["set", value, lead_ms, within_ms] => {
+                let [value, times @ ..] =
+                    [value, lead_ms, within_ms].map(|word| word.parse().expect("a number"));
+                let operator = operator.clone();
+                // On a thread of its own: a look is answered while the transaction waits for a restarted node.
+                std::thread::spawn(move || set(&operator, value, times.map(Duration::from_millis)));
+            }
             _ => panic!("{line:?} is no order"),
         }
     }
 }
 
 /// Sets the parameter of all nodes as one transaction.
-fn set(operator: &Sender, value: &str, times: [&str; 2]) {
-    let value = Value::Integer(value.parse().expect("a number"));
-    let [lead, within] = times.map(|ms| Duration::from_millis(ms.parse().expect("milliseconds")));
+fn set(operator: &Sender, value: u64, [lead, within]: [Duration; 2]) {
+    let value = Value::Integer(value as i64);
     let values = || vec![NamedValue { name: "number".to_owned(), value }];
     let sets = (0..NODES).map(|node| (name(node), values())).collect();
     match wait(operator.set_together(sets, lead, within)) {
