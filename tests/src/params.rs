@@ -134,11 +134,11 @@ fn play_kill(robot: &mut Robot, round: Round, report: &mut Report) {
         }
         Verdict::Repaired => {
             report.repaired += 1;
-            let is_true = is_new == Some(true) && restarted == value && answer.repaired == [victim];
+            // The outcome is sent at the tick, just before the loop reads the value.
+            let common = robot.wait_until_equal();
+            let is_true = is_new == Some(true) && common == Some(value) && answer.repaired == [victim];
             report.claim(is_true, || {
-                format!(
-                    "{answer:?}, but the restarted node {victim} has {restarted}, the others new: {is_new:?}"
-                )
+                format!("{answer:?}, but the nodes have {common:?}, the others new: {is_new:?}")
             });
         }
         Verdict::Mixed => report.claim(false, || format!("{answer:?} after {after:?}")),
