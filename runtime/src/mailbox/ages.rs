@@ -22,7 +22,7 @@ const FIRST_BITS: u32 = 4;
 /// and messages of unknown age are not counted.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct MessageAges {
-    /// The number of messages in each bucket. An age belongs to the first bucket whose bound it does not exceed.
+    /// The number of messages in each bucket. An age is counted in the first bucket with a bound that is not below it.
     pub counts: [u64; AGE_BUCKETS],
     /// The sum of all ages in nanoseconds.
     pub sum_ns: u64,

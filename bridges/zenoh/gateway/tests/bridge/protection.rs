@@ -24,6 +24,15 @@ types = ["robot.torque"]
 encoding = "json"
 "#;
 
+/// Ends a loop in another thread, also if the test fails: its scope waits for that thread.
+struct EndOnDrop<'a>(&'a AtomicBool);
+
+impl Drop for EndOnDrop<'_> {
+    fn drop(&mut self) {
+        self.0.store(true, Ordering::Relaxed);
+    }
+}
+
 #[test]
 fn protected_commands_pass_only_through_the_protected_sender() {
     let Some(mut stage) = Stage::start(RULES, "") else { return };
@@ -32,16 +41,16 @@ fn protected_commands_pass_only_through_the_protected_sender() {
     let (torque, other) = (stage.key("n/motor/robot.torque"), stage.key("n/knee.drive/robot.torque"));
     let is_over = AtomicBool::new(false);
     thread::scope(|scope| {
+        let _end = EndOnDrop(&is_over);
         scope.spawn(|| {
             while !is_over.load(Ordering::Relaxed) {
                 session.put(&torque, r#"{"newton_metres":2.5}"#).wait().expect("a session");
-                // The period of the type.
+                // Half of the period of the type.
                 thread::sleep(Duration::from_millis(50));
             }
         });
         stage.robot.wait_for(&["armed"]);
         stage.robot.wait_for(&["torque 2.5"]);
-        is_over.store(true, Ordering::Relaxed);
     });
     stage.bridge.wait_for(&["robot.torque is a protected type"]);
     // The rule has no protected sender.

@@ -101,7 +101,7 @@ impl Commands {
         Ok(Self { counts: counts.clone(), queue, _subscribers: subscribers, routes, name, address })
     }
 
-    /// Sends commands for ever. A node that ends is tried again each second.
+    /// Sends commands until the program ends. A lost node is tried again each second.
     pub(crate) async fn run(mut self, socket: PathBuf) -> Result<(), String> {
         let mut last = String::new();
         loop {

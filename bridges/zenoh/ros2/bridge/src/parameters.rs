@@ -113,7 +113,7 @@ impl Endpoints {
     }
 }
 
-/// Answers requests for ever.
+/// Answers requests until the program ends.
 ///
 /// # Errors
 /// The services have ended.

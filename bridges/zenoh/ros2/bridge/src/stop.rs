@@ -17,7 +17,7 @@ const REGISTERED_WITHIN: Duration = Duration::from_secs(2);
 /// Nodes that a response names.
 const NAMED_MAX: usize = 8;
 
-/// Presses the stop for each request, for ever.
+/// Presses the stop for each request, until the program ends.
 ///
 /// # Errors
 /// The service has ended.

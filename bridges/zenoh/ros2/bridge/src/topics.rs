@@ -67,7 +67,7 @@ impl Topics {
         Ok(Self { counts, all: rules.into_iter().map(declare).collect::<Result<_, String>>()? })
     }
 
-    /// Reads and publishes for ever. A node that ends is tried again each second.
+    /// Reads and publishes until the program ends. A lost node is tried again each second.
     pub(crate) fn run(mut self, socket: &Path) -> Result<(), String> {
         let mut last = String::new();
         loop {
